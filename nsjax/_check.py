@@ -1,0 +1,212 @@
+"""Mistakes in a model or in the arguments of `solve`, found before anything is integrated."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ._structure import is_affine, is_constant
+from ._system import impact, relay, sgn, System
+from ._types import Scalar, Y
+
+
+def _shape(tree: Any) -> Any:
+    return jax.tree.map(lambda x: f"{x.dtype.name}{list(x.shape)}", tree)
+
+
+def check_solve(
+    system: System,
+    t0: Any,
+    t1: Any,
+    y0: Y,
+    mode: Any,
+    solver: Any,
+    controller: Any,
+    saveat: Any,
+    max_steps: Any,
+    max_events: Any,
+) -> tuple[Y, Scalar, Scalar, dfx.AbstractStepSizeController, dict[str, Any]]:
+    """Converts and checks the arguments of `solve`."""
+    if not isinstance(system, System):
+        hint = " Call it: `solve(Model(), ...)`." if isinstance(system, type) else ""
+        raise TypeError(f"Argument `system` must be an instance of `nsjax.System`, but got {system!r}.{hint}")
+    if not isinstance(solver, dfx.AbstractSolver):
+        raise TypeError(f"Argument `solver` must be a diffrax solver such as `diffrax.Tsit5()`, but got {solver!r}.")
+    leaves = jax.tree.leaves(y0)
+    if not leaves:
+        raise ValueError("Argument `y0` must hold at least one number, but it is empty.")
+    for leaf in leaves:
+        kind = jnp.result_type(leaf)
+        if jnp.issubdtype(kind, jnp.complexfloating):
+            raise TypeError("Argument `y0` must be real, but has a complex leaf; split it into real and imaginary part.")
+        if not isinstance(leaf, (float, int)) and not jnp.issubdtype(kind, jnp.floating):
+            raise TypeError(f"Argument `y0` must be of floating point dtype, but has a leaf of dtype {kind}.")
+        if isinstance(leaf, (bool, int)):
+            raise TypeError(f"Argument `y0` must hold floating point numbers, but has the integer {leaf!r}; write {leaf}.0.")
+    dtype = jnp.result_type(*leaves)
+    dtype = jnp.result_type(float) if all(isinstance(x, float) for x in leaves) else dtype
+    y0 = jax.tree.map(lambda x: jnp.asarray(x, dtype), y0)
+    t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
+    for name, t in (("t0", t0), ("t1", t1)):
+        if t.shape != ():
+            raise ValueError(f"Argument `{name}` must be a scalar, but has shape {t.shape}; use `jax.vmap` for many.")
+    for name, value in (("max_steps", max_steps), ("max_events", max_events)):
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"Argument `{name}` must be a positive integer, but got {value!r}.")
+    if not isinstance(saveat, dfx.SaveAt) or not (
+        isinstance(saveat.subs, dfx.SubSaveAt) or (saveat.dense and saveat.subs is None)
+    ):
+        raise ValueError(f"Argument `saveat` must be a `diffrax.SaveAt` without nested `subs`, but got {saveat!r}.")
+    for name in ("solver_state", "controller_state", "made_jump"):
+        if getattr(saveat, name):
+            raise ValueError(f"Argument `saveat` must not ask for `{name}`, which a flow with events does not have.")
+    return y0, t0, t1, _controller(controller, dtype), _given(system, mode)
+
+
+def _controller(controller: Any, dtype: Any) -> dfx.AbstractStepSizeController:
+    eps = float(jnp.finfo(dtype).eps)
+    if controller is None:
+        tol = 1e-8 if eps < 1e-10 else 1e-5
+        return dfx.PIDController(rtol=tol, atol=tol)
+    if not isinstance(controller, dfx.AbstractStepSizeController):
+        raise TypeError(
+            "Argument `stepsize_controller` must be a diffrax step size controller, such as "
+            f"`diffrax.PIDController(rtol=1e-8, atol=1e-8)`, but got {controller!r}."
+        )
+    rtol = getattr(controller, "rtol", None)
+    if isinstance(rtol, (int, float)) and 0 < rtol < 4 * eps:
+        cure = (
+            "Call `jax.config.update('jax_enable_x64', True)` and pass float64 values, or loosen the tolerance."
+            if eps > 1e-10
+            else "Loosen the tolerance."
+        )
+        raise ValueError(
+            f"Argument `stepsize_controller` must have a tolerance that {dtype} can hold (rtol >= {4 * eps:.1e}), but got "
+            f"rtol = {rtol:.1e}. {cure}"
+        )
+    return controller
+
+
+def _given(system: System, mode: Any) -> dict[str, Any]:
+    switches = {k.name: k for k in system.switches}
+    if mode is None:
+        return {}
+    if not isinstance(mode, Mapping):
+        values = list(mode)
+        if len(values) != len(switches):
+            raise ValueError(
+                f"Argument `mode` must have one value for each of the {len(switches)} switches ({', '.join(switches)}), "
+                f"but got {len(values)}."
+            )
+        mode = {n: v for (n, k), v in zip(switches.items(), values) if not isinstance(k, impact)}
+    for name, value in mode.items():
+        if name not in switches:
+            known = ", ".join(f"`{n}`" for n in switches) or "none"
+            raise ValueError(f"Argument `mode` must name switches of the system, but got `{name}`; they are: {known}.")
+        if isinstance(switches[name], impact):
+            raise ValueError(f"Argument `mode` must not name `{name}`: an impact surface has no mode to choose.")
+        allowed = (0, 1) if isinstance(switches[name], relay) else (-1, 0, 1)
+        if isinstance(value, int) and value not in allowed:
+            raise ValueError(f"Argument `mode` must give `{name}` one of {allowed}, but got {value}.")
+    return {n: jnp.asarray(v, jnp.int32) for n, v in mode.items()}
+
+
+def check_model(system: System, t: Scalar, y: Y, direction: Scalar) -> None:
+    """Checks the model where that needs no numbers: structure, shapes, and dependence on the switch values."""
+    name = type(system).__name__
+    switches = system.switches
+    names = [k.name for k in switches]
+    for n in set(names):
+        if names.count(n) > 1:
+            raise ValueError(f"`{name}.switches` must have different names, but `{n}` occurs {names.count(n)} times.")
+    zeros = tuple(jnp.zeros((), t.dtype) for _ in switches)
+
+    def field(s: tuple) -> Y:
+        return system.vector_field(t, y, system.values(s))
+
+    out = jax.eval_shape(field, zeros)
+    have, want = jax.tree.structure(out), jax.tree.structure(y)
+    if have != want:
+        raise ValueError(
+            f"`{name}.vector_field` must return the structure of the state, {want}, but returned {have}. "
+            "Return the same kind of tuple, dictionary or array as `y0`."
+        )
+    for (path, f), x in zip(jax.tree_util.tree_leaves_with_path(out), jax.tree.leaves(y)):
+        if f.shape != x.shape or f.dtype != x.dtype:
+            where = jax.tree_util.keystr(path)
+            raise ValueError(
+                f"`{name}.vector_field` must return leaves of the shapes and dtypes of the state, but its leaf "
+                f"`{where or 'y'}` is {f.dtype}{list(f.shape)} where the state has {x.dtype}{list(x.shape)}."
+            )
+    for k, switch in enumerate(switches):
+        _check_guard(name, switch.name, switch.guard, system, t, y)
+        if isinstance(switch, sgn):
+            _check_sgn(name, k, switch, system, field, zeros)
+        elif isinstance(switch, relay):
+            if switch.off_guard is None:
+                raise ValueError(
+                    f"`{name}.{switch.name}` is a relay without the surface on which it switches off; add one with "
+                    f"`@{switch.name}.off`."
+                )
+            _check_guard(name, f"{switch.name}.off", switch.off_guard, system, t, y)
+            if isinstance(switch.guard(system, t, y), tuple) or isinstance(switch.off_guard(system, t, y), tuple):
+                raise ValueError(f"`{name}.{switch.name}` is a relay: its surfaces must be scalars, not tuples.")
+            eqx.error_if(t, direction < 0, f"`{name}.{switch.name}` is a relay, whose memory cannot be run backwards.")
+        else:
+            assert isinstance(switch, impact)
+            _check_impact(name, k, switch, system, t, y, field, zeros)
+
+
+def _check_guard(owner: str, name: str, guard: Any, system: System, t: Scalar, y: Y) -> None:
+    h = jax.eval_shape(lambda: guard(system, t, y))
+    for part in h if isinstance(h, tuple) and not hasattr(h, "_fields") else (h,):
+        if not isinstance(part, jax.ShapeDtypeStruct) or part.shape != () or part.dtype != t.dtype:
+            got = part if not isinstance(part, jax.ShapeDtypeStruct) else f"{part.dtype}{list(part.shape)}"
+            raise ValueError(
+                f"`{owner}.{name}` must return a scalar of dtype {t.dtype} (or a tuple of them, meaning their minimum), "
+                f"but returned {got}. For many surfaces define a switch for each, or override `switches`."
+            )
+
+
+def _check_sgn(owner: str, k: int, switch: sgn, system: System, field: Any, zeros: tuple) -> None:
+    def along(sk: Scalar) -> Y:
+        return field(zeros[:k] + (sk,) + zeros[k + 1 :])
+
+    if not is_affine(along, zeros[k]):
+        raise ValueError(
+            f"`{owner}.vector_field` must be affine in `s.{switch.name}`, as the sliding field (2.19) is the convex "
+            "combination of the fields on both sides, but it is not. Use it as a factor of a term: not inside a "
+            "function, in a power, in `jnp.where`, or in a denominator. For two different laws write "
+            f"`0.5 * (1 + s.{switch.name}) * plus + 0.5 * (1 - s.{switch.name}) * minus`."
+        )
+    bound = switch.bound(system)
+    if jnp.shape(bound) != ():
+        raise ValueError(f"`{owner}.{switch.name}.breakaway` must return a scalar, but its shape is {jnp.shape(bound)}.")
+
+
+def _check_impact(
+    owner: str, k: int, switch: impact, system: System, t: Scalar, y: Y, field: Any, zeros: tuple
+) -> None:
+    name = switch.name
+    if (switch.reset_fn is None) == (switch.restitution_fn is None):
+        raise ValueError(
+            f"`{owner}.{name}` is an impact: give it either `@{name}.reset` (the state after it) or "
+            f"`@{name}.restitution` (Newton's coefficient e)."
+        )
+    if switch.reset_fn is not None:
+        reset = switch.reset_fn
+        after = jax.eval_shape(lambda: reset(system, t, y))
+        want = jax.eval_shape(lambda: y)
+        if jax.tree.structure(after) != jax.tree.structure(want) or _shape(after) != _shape(want):
+            raise ValueError(
+                f"`{owner}.{name}.reset` must return a state of the structure {_shape(want)}, but returned {_shape(after)}."
+            )
+    elif is_constant(lambda sk: field(zeros[:k] + (sk,) + zeros[k + 1 :]), zeros[k]):
+        raise ValueError(
+            f"`{owner}.{name}.restitution` needs the direction of the impulse, which is that of the contact force "
+            f"`s.{name}` in `vector_field`, but it does not occur there. Add it to the equation of motion "
+            f"(`+ s.{name} / m`), or write the jump out with `@{name}.reset`."
+        )

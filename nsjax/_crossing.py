@@ -1,0 +1,177 @@
+"""The first root of a polynomial guard on a step, by sign variations of its Bernstein coefficients.
+
+A sign test at the two ends of a step misses pairs of roots. The number of sign variations of the Bernstein
+coefficients bounds the number of roots from above (Descartes), is exact when 0 or 1, and becomes so by subdivision, so
+that each root is isolated or excluded.
+"""
+
+import functools as ft
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Scalar
+
+
+DEPTH = 40  # bisections: closer roots than 2**-40 of a step are one
+
+
+def nodes(degree: int) -> np.ndarray:
+    """Chebyshev-Lobatto nodes on [0, 1], ends included."""
+    return 0.5 - 0.5 * np.cos(np.pi * np.arange(degree + 1) / max(degree, 1))
+
+
+@ft.lru_cache
+def to_bernstein(degree: int) -> np.ndarray:
+    """Matrix from values at `nodes(degree)` to Bernstein coefficients."""
+    x = nodes(degree)[:, None]
+    j = np.arange(degree + 1)
+    binomial = np.array([math.comb(degree, int(i)) for i in j])
+    matrix = np.linalg.inv(binomial * x**j * (1 - x) ** (degree - j))
+    matrix[0], matrix[-1] = np.eye(degree + 1)[0], np.eye(degree + 1)[-1]
+    return matrix
+
+
+@ft.lru_cache
+def to_chebyshev(degree: int) -> np.ndarray:
+    """Matrix from values at `nodes(degree)` to Chebyshev coefficients, whose last ones tell the resolution."""
+    return np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * nodes(degree) - 1, degree))
+
+
+def deflate(c: Float[Array, "... coefficients"], roots: Int[Array, "..."]) -> Float[Array, "... coefficients"]:
+    """Divides by τ once or twice (`roots` = 1 or 2), keeping the degree: takes out known roots at τ = 0."""
+    n = c.shape[-1] - 1
+    j = np.arange(n + 1)
+
+    def once(c: Array) -> Array:
+        # τ B_{j-1}^{n-1} = (j/n) B_j^n, so q = c_j n/j of degree n-1; then elevated to degree n.
+        q = c[..., 1:] * (n / j[1:])
+        lower = jnp.concatenate([q[..., :1], q], axis=-1)
+        upper = jnp.concatenate([q, q[..., -1:]], axis=-1)
+        return (j / n) * lower + (1 - j / n) * upper
+
+    first = once(c)
+    roots = roots[..., None]
+    # Dividing twice a polynomial of degree n = 1 leaves only the slope, which is what `once` of `once` gives.
+    return jnp.where(roots == 0, c, jnp.where(roots == 1, first, once(first)))
+
+
+def no_root(c: Float[Array, "... parts coefficients"]) -> Bool[Array, "..."]:
+    """Whether the maximum over the parts is certainly positive on the whole step."""
+    return jnp.any(jnp.all(c > 0, axis=-1), axis=-1)
+
+
+def _restrict(c: Float[Array, "parts coefficients"], a: Scalar, b: Scalar) -> Float[Array, "parts coefficients"]:
+    """Bernstein coefficients on [a, b] of the polynomial given on [0, 1], by de Casteljau's scheme."""
+    n = c.shape[-1] - 1
+
+    def left(c: Array, u: Scalar) -> Array:
+        out = [c[..., 0]]
+        for _ in range(n):
+            c = c[..., :-1] + u * (c[..., 1:] - c[..., :-1])
+            out.append(c[..., 0])
+        return jnp.stack(out, axis=-1)
+
+    head = left(c, b)  # on [0, b]
+    return left(head[..., ::-1], 1 - a / b)[..., ::-1]
+
+
+def evaluate(c: Float[Array, "... coefficients"], u: Scalar) -> Float[Array, "..."]:
+    """The polynomial at u."""
+    for _ in range(c.shape[-1] - 1):
+        c = c[..., :-1] + u * (c[..., 1:] - c[..., :-1])
+    return c[..., 0]
+
+
+def _polish(c: Float[Array, " coefficients"]) -> Scalar:
+    """The one root on [0, 1] of a polynomial with c[0] > 0 >= c[-1]: Newton's method kept inside the bracket."""
+    n = c.shape[-1] - 1
+    slope = n * (c[1:] - c[:-1])
+    eps = jnp.finfo(c.dtype).eps
+
+    def improve(state: tuple) -> tuple:
+        low, high, u, _, count = state
+        value = evaluate(c, u)
+        low = jnp.where(value > 0, u, low)
+        high = jnp.where(value > 0, high, u)
+        newton = u - value / evaluate(slope, u)
+        inside = (newton > low) & (newton < high)
+        # Every third step bisects unless Newton has all but halted: a flat polynomial cannot stall the search.
+        new = jnp.where(inside & ((count % 3 != 2) | (jnp.abs(newton - u) < 1e-3)), newton, 0.5 * (low + high))
+        new = jnp.where(value == 0, u, new)
+        done = (jnp.abs(new - u) <= 2 * eps * u) | (high - low <= eps * high)
+        return low, high, new, done, count + 1
+
+    def busy(state: tuple) -> Bool[Array, ""]:
+        *_, done, count = state
+        return ~done & (count < 100)
+
+    guess = jnp.clip(c[0] / (c[0] - c[-1]), 0.0, 1.0)
+    start = (jnp.zeros_like(guess), jnp.ones_like(guess), guess, jnp.zeros((), bool), jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(busy, improve, start)[2]
+
+
+def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], Scalar]:
+    """The earliest τ in [0, 1] at which the maximum of the polynomials over the parts is no longer positive.
+
+    Walks through dyadic intervals from the left: one without a root is passed, one with exactly one is done, any other
+    is halved. A root that 40 halvings do not separate from its neighbour (a double root) is reported where it is.
+
+    **Arguments:**
+
+    - `c`: Bernstein coefficients on the step.
+
+    **Returns:** whether there is one, and its place (1 if there is none).
+    """
+    one = jnp.ones((), c.dtype)
+
+    def ends(level: Array, index: Array) -> tuple[Scalar, Scalar]:
+        width = one * 0.5**level
+        return index * width, (index + 1) * width
+
+    def look(level: Array, index: Array) -> tuple[Array, Bool[Array, ""], Bool[Array, ""], Int[Array, ""]]:
+        a, b = ends(level, index)
+        local = jnp.where(level == 0, c, _restrict(c, a, b))
+        positive = local > 0
+        variations = jnp.sum(positive[:, 1:] != positive[:, :-1], axis=-1)
+        single = (variations == 1) & positive[:, 0]
+        silent = jnp.sum(~jnp.all(~positive, axis=-1)) == 1  # all other parts are negative throughout
+        begun = jnp.all(~positive[:, 0])
+        sure = begun | (jnp.any(single) & silent) | (level >= DEPTH)
+        return local, no_root(local), sure, jnp.argmax(single)
+
+    def busy(state: tuple) -> Bool[Array, ""]:
+        *_, done = state
+        return ~done
+
+    def walk(state: tuple) -> tuple:
+        level, index, _, _ = state
+        _, free, sure, _ = look(level, index)
+        # Past this interval: the next one at the coarsest level that starts there.
+        after = index + 1
+        up = jnp.zeros((), jnp.int32)
+        moved = after
+        for shift in (32, 16, 8, 4, 2, 1):
+            even = (moved & ((1 << shift) - 1)) == 0
+            up = up + jnp.where(even, shift, 0)
+            moved = jnp.where(even, moved >> shift, moved)
+        up = jnp.minimum(up, level)
+        over = free & ((after >> level) == 1)
+        next_level = jnp.where(free, level - up, level + 1)
+        next_index = jnp.where(free, after >> up, 2 * index)
+        done = sure & ~free | over
+        level = jnp.where(done, level, next_level)
+        index = jnp.where(done, index, next_index)
+        return level, index, sure & ~free, done
+
+    integer = jnp.int64 if jax.config.jax_enable_x64 else jnp.int32
+    start = (jnp.zeros((), integer), jnp.zeros((), integer), jnp.zeros((), bool), jnp.zeros((), bool))
+    level, index, found, _ = jax.lax.while_loop(busy, walk, start)
+    a, b = ends(level, index)
+    local, _, _, part = look(level, index)
+    begun = jnp.all(local[:, 0] <= 0)
+    polished = found & ~begun & (local[part, 0] > 0) & (local[part, -1] <= 0)
+    safe = jnp.where(polished, local[part], jnp.linspace(1.0, -1.0, c.shape[-1], dtype=c.dtype))
+    root = a + (b - a) * jnp.where(polished, _polish(safe), jnp.where(begun, 0.0, 0.5))
+    return found, jnp.where(found, root, one)

@@ -1,0 +1,153 @@
+"""What `solve` returns: saved states, the event log, dense output, and why it ended."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ._step import bernstein
+from ._system import System
+from ._types import Scalar, Y
+
+
+class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """Diffrax's results, and those of nonsmooth flows."""
+
+    max_events_reached = (
+        "The maximum number of events was reached. Increase `max_events`; if events crowd together, look at `sol.events`."
+    )
+    accumulation_reached = (
+        "Impacts accumulated (Zeno): infinitely many in a finite time. `sol.t1` and `sol.y1` hold the time and the state "
+        "at the accumulation point, where contact begins to last."
+    )
+    repulsive_sliding = (
+        "The start lies on a surface which both fields leave (2.25): the solution is not unique. Choose one by "
+        "`mode={'name': 0}` to stay on the surface, or +1 or -1 to leave it to that side."
+    )
+    ambiguous_event = (
+        "Several switches met their surfaces at one instant, and no combination of sticking and slipping satisfies all "
+        "of their laws (or was found to)."
+    )
+    stuck_in_events = (
+        "Events followed one another without any progress in time: the model chatters. A relay whose two surfaces "
+        "coincide, or a reset that does not leave its surface, does this."
+    )
+    nonfinite_field = "The vector field or an indicator function returned a value that is not finite (NaN or infinity)."
+    wrong_mode = "Argument `mode` places the start on one side of a surface, but `y0` lies clearly on the other."
+    wrong_reset = (
+        "A reset left the state on the wrong side of its surface (h < 0), or still approaching it (dh/dt < 0). Check the "
+        "signs in the method decorated with `.reset` (or a coefficient of restitution below 0)."
+    )
+
+
+class Event(NamedTuple):
+    """One event of a solution, as `for event in sol.events` yields it."""
+
+    t: Any
+    switch: str
+    mode_before: dict[str, int]
+    mode_after: dict[str, int]
+    y_before: Any
+    y_after: Any
+
+
+class Events(eqx.Module):
+    """The event log, in order of time, padded to `max_events` rows (time infinite, switch -1).
+
+    **Attributes:**
+
+    - `t`: times, shape `(max_events,)`.
+    - `switch`: which switch, as its position in `names`.
+    - `mode_before`, `mode_after`: shape `(max_events, number of switches)`; for `sgn` +1, -1, or 0 while sliding.
+    - `y_before`, `y_after`: the state on either side, leaves with a leading axis of length `max_events`.
+    - `num`: how many there were.
+    """
+
+    t: Float[Array, " events"]
+    switch: Int[Array, " events"]
+    mode_before: Int[Array, "events switches"]
+    mode_after: Int[Array, "events switches"]
+    y_before: Y
+    y_after: Y
+    num: Int[Array, ""]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return int(self.num)
+
+    def __getitem__(self, i: int) -> Event:
+        n = len(self)
+        if not -n <= i < n:
+            raise IndexError(f"There are {n} events.")
+        i = i % n
+
+        def named(mode: Array) -> dict[str, int]:
+            return {name: int(m) for name, m in zip(self.names, mode)}
+
+        at = jax.tree.map(lambda x: x[i], (self.t, self.y_before, self.y_after))
+        return Event(
+            at[0], self.names[int(self.switch[i])], named(self.mode_before[i]), named(self.mode_after[i]), at[1], at[2]
+        )
+
+    def __iter__(self) -> Iterator[Event]:
+        return (self[i] for i in range(len(self)))
+
+    def __str__(self) -> str:
+        lines = []
+        for e in self:
+            changes = [f"{n} {e.mode_before[n]:+d} -> {e.mode_after[n]:+d}" for n in self.names]
+            changes = [c for n, c in zip(self.names, changes) if e.mode_before[n] != e.mode_after[n]] or ["reset"]
+            state = ", ".join(f"{x:.6g}" for x in np.concatenate([np.ravel(l) for l in jax.tree.leaves(e.y_after)]))
+            lines.append(f"t = {float(e.t):<18.12g} {e.switch}: {', '.join(changes)}   y = ({state})")
+        return "\n".join(lines) or "no events"
+
+
+class Solution(eqx.Module):
+    """The solution of a piecewise-smooth system.
+
+    **Attributes:**
+
+    - `t0`, `t1`: where it starts and where it ended (before the requested end if it failed or accumulated).
+    - `y1`, `mode1`: the state and the mode at `t1`.
+    - `ts`, `ys`, `modes`: what `saveat` asked for, in order of time, padded with infinities (modes with -128).
+    - `events`: the event log.
+    - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`, `num_events`.
+    - `result`: `RESULTS`; why it ended.
+
+    With `SaveAt(dense=True)`, `sol(t)` is the state at any time; at the instant of an event it is the state before
+    with `left=True` (the default) and the state after with `left=False`.
+    """
+
+    system: System
+    t0: Scalar
+    t1: Scalar
+    y1: Y
+    mode1: Int[Array, " switches"]
+    ts: Float[Array, " times"] | None
+    ys: Any
+    modes: Int[Array, "times switches"] | None
+    events: Events
+    stats: dict[str, Any]
+    result: RESULTS
+    dense: Any = None  # (end times of steps, control points) in internal time, and its direction
+
+    def evaluate(self, t: Any, left: bool = True) -> Y:
+        """The state at time `t` (scalar); at an event the one before it, or after it with `left=False`."""
+        if self.dense is None:
+            raise ValueError("Dense output was not kept; call `solve` with `saveat=SaveAt(dense=True)`.")
+        starts, stops, points, direction, steps = self.dense
+        s = jnp.asarray(t, starts.dtype) * direction
+        i = jnp.searchsorted(stops, s, side="left" if left else "right")
+        i = jnp.clip(i, 0, jnp.maximum(steps - 1, 0))
+        length = stops[i] - starts[i]
+        u = jnp.where(length > 0, (s - starts[i]) / jnp.where(length > 0, length, 1), 1.0)
+        return bernstein(jax.tree.map(lambda p: p[i], points), u)
+
+    def __call__(self, t: Any, left: bool = True) -> Y:
+        return self.evaluate(t, left)
+

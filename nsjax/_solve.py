@@ -1,0 +1,475 @@
+"""The flow: one flat loop whose body is one step of a diffrax solver.
+
+Under `vmap` every lane is in its own mode and at its own time: it takes a step, or works on its event, and never waits
+for the segments of the others.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from ._check import check_model, check_solve
+from ._crossing import deflate, no_root, nodes, to_bernstein, to_chebyshev
+from ._event import Landing, land
+from ._filippov import Model, State
+from ._save import Log, Saved
+from ._solution import Events, RESULTS, Solution
+from ._step import bernstein, Stepper
+from ._structure import is_affine
+from ._system import arrays_of, impact, relay, sgn, System
+from ._types import Mode, Scalar, Y
+
+
+class _Carry(eqx.Module):
+    """What one turn of the loop hands to the next."""
+
+    t: Scalar
+    y: Y
+    f: Y  # the field at (t, y)
+    state: State
+    dt: Scalar
+    controller: PyTree
+    active: Bool[Array, ""]
+    result: RESULTS
+    steps: Int[Array, ""]
+    accepted: Int[Array, ""]
+    events: Int[Array, ""]
+    halted: Int[Array, ""]  # events in a row without progress in time
+    halvings: Int[Array, ""]  # in a row, to resolve a guard
+    log: Log | None
+    saved: Saved
+    meter: PyTree
+
+
+def _start(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[State, RESULTS]:
+    """The mode in which the solution sets out: from the signs of h, from `mode=`, and on a surface by the fields."""
+    modes, parts, roots, at = [], [], [], {}
+    result = RESULTS.successful
+    on = {}
+    for k, switch in enumerate(model.switches):
+        zero = jnp.zeros((), jnp.int32)
+        if isinstance(switch, relay):
+            up = switch.guard(model.system, t * model.direction, y) > 0
+            down = switch.off_guard(model.system, t * model.direction, y) > 0
+            held = jnp.asarray(given.get(switch.name, 0), jnp.int32)
+            modes.append(jnp.where(up & ~down, 1, jnp.where(down, 0, held)).astype(jnp.int32))
+            parts.append(None)
+            roots.append(zero)
+            continue
+        h = jnp.stack(model.h(k, t, y))
+        noise = model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y)
+        part = jnp.argmin(h)
+        h, noise = h[part], noise[part]
+        on[k] = jnp.abs(h) <= noise
+        parts.append(part.astype(jnp.int32) if model.parts[k] > 1 else None)
+        roots.append(zero)
+        if isinstance(switch, impact):
+            modes.append(zero)
+            result = RESULTS.where(h < -noise, RESULTS.wrong_mode, result)
+        elif switch.name in given:
+            mode = jnp.asarray(given[switch.name], jnp.int32)
+            # A state taken from an earlier solution may carry some drift off its surface.
+            off = jnp.where(mode == 0, jnp.abs(h) > 1e6 * noise, mode * h < -1e6 * noise)
+            result = RESULTS.where(off, RESULTS.wrong_mode, result)
+            modes.append(mode)
+            at[k] = jnp.zeros((), bool)
+            on[k] = mode * h <= noise
+        else:
+            modes.append(jnp.where(on[k], 0, jnp.sign(h)).astype(jnp.int32))
+            at[k] = on[k]
+    state = State(tuple(modes), tuple(parts), tuple(roots))
+    state, unsure, wrong = model.settle(t, y, state, at, {k: jnp.zeros((), jnp.int32) for k in at})
+    result = RESULTS.where(unsure, RESULTS.repulsive_sliding, result)
+    result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
+    # Guards of surfaces on which the start lies have a root there already.
+    roots = list(state.roots)
+    s = model.values(t, y, state)
+    for k, here in on.items():
+        rate = model._rates((k,), t, y, state, s)[0]
+        sign = jnp.where(jnp.asarray(isinstance(model.switches[k], impact)), 1, state.mode[k])
+        scale = jnp.sqrt(jnp.finfo(t.dtype).eps) * _size(model, k, t, y, state, s)
+        fresh = jnp.where(jnp.abs(rate) > scale, 1, 2)
+        settled = at.get(k, jnp.zeros((), bool))
+        roots[k] = jnp.where(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
+    return state._replace(roots=tuple(roots)), result
+
+
+def _size(model: Model, k: int, t: Scalar, y: Y, state: State, s: tuple) -> Scalar:
+    """The largest that dh/dt could be for the components of the field: what its rounding is measured by."""
+    f = model.field(t, y, s)
+    total = jnp.zeros((), t.dtype)
+    for i, leaf in enumerate(jax.tree.leaves(f)):
+        only = jax.tree.unflatten(
+            jax.tree.structure(f),
+            [x if i == j else jnp.zeros_like(x) for j, x in enumerate(jax.tree.leaves(f))],
+        )
+        part = jax.jvp(lambda y: jnp.min(jnp.stack(model.h(k, t, y))), (y,), (only,))[1]
+        total = total + jnp.abs(part)
+    return total
+
+
+class _Flow(eqx.Module):
+    """One solve: the model, the method, and the body of its loop."""
+
+    model: Model
+    stepper: Stepper
+    controller: dfx.AbstractStepSizeController
+    t0: Scalar
+    t1: Scalar
+    max_steps: int = eqx.field(static=True)
+    max_events: int = eqx.field(static=True)
+    keep_steps: int = eqx.field(static=True)
+    want_points: bool = eqx.field(static=True)
+    meter: dfx.AbstractProgressMeter
+    degree: int | None = eqx.field(static=True)  # of guards that are not affine in (t, y); None if they are
+
+    def coefficients(
+        self, t: Scalar, t_next: Scalar, y: Y, y1: Y, ks: list[Y], state: State
+    ) -> tuple[Float[Array, "slots parts coefficients"], Bool[Array, ""]]:
+        """Bernstein coefficients of the guards along a step, and whether they represent them well enough."""
+        if self.degree is None:
+            n = self.stepper.degree
+            points = self.stepper.points(y, y1, ks)
+            times = t + (t_next - t) * jnp.arange(n + 1) / n
+            values = jax.vmap(lambda t, y: self.model.guards(t, y, state))(times, points)
+            return jnp.moveaxis(values, 0, -1), jnp.ones((), bool)
+        n = self.degree
+        times = t + (t_next - t) * jnp.asarray(nodes(n), t.dtype)
+        values = jax.vmap(lambda t, y: self.model.guards(t, y, state))(times, self.stepper.samples(y, y1, ks, n))
+        values = jnp.moveaxis(values, 0, -1)
+        tail = jnp.abs(values @ jnp.asarray(to_chebyshev(n)[-2:].T, t.dtype)).max(-1)
+        resolved = jnp.all(tail <= 1e-7 * jnp.max(jnp.abs(values), axis=-1))
+        return values @ jnp.asarray(to_bernstein(n).T, t.dtype), resolved
+
+    def body(self, c: _Carry) -> _Carry:
+        model, stepper = self.model, self.stepper
+
+        def flow(t: Scalar, y: Y) -> Y:
+            return model.flow(t, y, c.state)
+
+        t_next = jnp.where(c.t + c.dt >= self.t1, self.t1, c.t + c.dt)
+        y1, error, ks, _ = stepper(flow, c.t, t_next, c.y, c.f)
+        terms = dfx.ODETerm(lambda t, y, args: flow(t, y))
+        keep, a, b, _, controller, outcome = self.controller.adapt_step_size(
+            c.t, t_next, c.y, y1, None, error, stepper.solver.error_order(terms), c.controller
+        )
+        dt = lax.stop_gradient(b - a)
+        halvings = c.halvings
+        result = RESULTS.promote(outcome)
+
+        if model.slots:
+            coefficients, resolved = self.coefficients(c.t, t_next, c.y, y1, ks, c.state)
+            finite = jnp.all(jnp.isfinite(coefficients))
+            result = RESULTS.where(keep & ~finite, RESULTS.nonfinite_field, result)
+            # A guard that is no polynomial to the precision needed is not trusted: a shorter step is. (At most so
+            # often: one with a kink never is.)
+            poor = keep & finite & ~resolved & (halvings < 30)
+            halvings = jnp.where(poor, halvings + 1, jnp.where(keep, 0, halvings))
+            keep = keep & ~poor
+            dt = jnp.where(poor, 0.5 * (t_next - c.t), dt)
+            coefficients = deflate(coefficients, model.known_roots(c.state))
+            busy = c.active & keep & finite & ~jnp.all(no_root(coefficients))
+        keep = keep & c.active
+
+        y_end = model.project(t_next, y1, c.state)
+        f_end = stepper.last_slope(ks, t_next - c.t, flow, t_next, y_end)
+        t, y, f, state = t_next, y_end, f_end, c.state
+        event = jnp.zeros((), bool)
+        events, halted, log = c.events, c.halted, c.log
+        t_stop, points, before = t_next, None, y1
+        if self.want_points:
+            points = stepper.points(c.y, y1, ks)
+        if model.slots:
+            still = Landing(
+                event, t_next, t_next, y1, y_end, c.state, jnp.zeros((), jnp.int32), event, ks, RESULTS.successful
+            )
+
+            def at_event() -> tuple[Landing, Y]:
+                there = land(model, stepper, self.t0, c.t, t_next, c.y, c.f, c.state, coefficients)
+                return there, model.flow(there.t_after, there.y_after, there.state)
+
+            def no_event() -> tuple[Landing, Y]:
+                return still, f_end
+
+            there, f_there = _cond(eqxi.unvmap_any(busy), at_event, no_event)
+            event = busy & there.found
+
+            def pick(x: Any, y: Any) -> Any:
+                return jax.tree.map(lambda a, b: jnp.where(event, a, b), x, y)
+
+            t, y, f, state = pick(
+                (there.t_after, there.y_after, f_there, there.state), (t_next, y_end, f_end, c.state)
+            )
+            state = pick(state, state._replace(roots=tuple(jnp.zeros_like(r) for r in state.roots)))
+            t_stop, before = pick((there.t, there.y_before), (t_next, y1))
+            if self.want_points:
+                points = pick(stepper.points(c.y, there.y_before, there.increments), points)
+            log_it = event & there.news
+            assert log is not None
+            log = log.write(
+                events, log_it, there.t * model.direction, there.y_before, there.y_after, there.slot, there.state.mode
+            )
+            events = events + log_it
+            halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(keep, 0, halted))
+            result = RESULTS.where(event, there.result, result)
+            result = RESULTS.where(halted > 8 + 4 * len(model.switches), RESULTS.stuck_in_events, result)
+
+        # What happened to this lane: an event, an accepted step, a rejected one, or nothing as it has ended.
+        moved = keep | event
+
+        def settle(new: Any, old: Any) -> Any:
+            return jax.tree.map(lambda a, b: jnp.where(moved, a, b), new, old)
+
+        saved = c.saved
+        if saved.request.ts is not None:
+            saved = saved.write_times(moved, c.t, t_stop, points, c.state.mode, model.system, model.direction)
+        saved = saved.write_step(moved, c.accepted, c.t, t_stop, points)
+        accepted = c.accepted + moved
+        if self.keep_steps:
+            due = moved & ((accepted % self.keep_steps == 0) | event)
+            saved = saved.write(due, t_stop, before, c.state.mode, model.system, model.direction)
+            saved = saved.write(due & event, t, y, state.mode, model.system, model.direction)
+        t, y, f, state = settle((t, y, f, state), (c.t, c.y, c.f, c.state))
+
+        steps = c.steps + c.active
+        done = t >= self.t1
+        result = RESULTS.where((steps >= self.max_steps) & ~done & (result == RESULTS.successful), RESULTS.max_steps_reached, result)
+        if model.slots:
+            full = (events >= self.max_events) & ~done & (result == RESULTS.successful)
+            result = RESULTS.where(full, RESULTS.max_events_reached, result)
+        bad = ~jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((y, f))]).all()
+        result = RESULTS.where(bad, RESULTS.nonfinite_field, result)
+        tiny = ~moved & (t + dt <= t)
+        result = RESULTS.where(tiny & (result == RESULTS.successful), RESULTS.dt_min_reached, result)
+        result = RESULTS.where(c.active, result, c.result)
+        active = c.active & ~done & (result == RESULTS.successful)
+        meter = self.meter.step(c.meter, jnp.where(active, (t - self.t0) / (self.t1 - self.t0), 1.0))
+
+        def hold(new: Any, old: Any) -> Any:
+            return jax.tree.map(lambda a, b: jnp.where(c.active, a, b), new, old)
+
+        return _Carry(
+            t=t,
+            y=y,
+            f=f,
+            state=state,
+            dt=hold(dt, c.dt),
+            controller=hold(controller, c.controller),
+            active=active,
+            result=result,
+            steps=steps,
+            accepted=accepted,
+            events=events,
+            halted=halted,
+            halvings=halvings,
+            log=log,
+            saved=saved,
+            meter=meter,
+        )
+
+
+def _cond(pred: Any, yes: Any, no: Any) -> Any:
+    """`lax.cond` for branches whose results hold static leaves."""
+    dynamic_yes = lambda: eqx.filter(yes(), eqx.is_array)  # noqa: E731
+    dynamic_no = lambda: eqx.filter(no(), eqx.is_array)  # noqa: E731
+    static = eqx.filter(no(), eqx.is_array, inverse=True)
+    return eqx.combine(lax.cond(pred, dynamic_yes, dynamic_no), static)
+
+
+@eqx.filter_jit
+def _run(
+    system: System,
+    t0: Scalar,
+    t1: Scalar,
+    y0: Y,
+    given: dict[str, Any],
+    solver: dfx.AbstractSolver,
+    controller: dfx.AbstractStepSizeController,
+    saveat: dfx.SaveAt,
+    dt0: Scalar | None,
+    max_steps: int,
+    max_events: int,
+    throw: bool,
+    meter: dfx.AbstractProgressMeter,
+) -> Solution:
+    direction = jnp.where(t1 >= t0, 1, -1).astype(t0.dtype)
+    check_model(system, t0, y0, direction)
+    start, stop = t0 * direction, t1 * direction
+    model = Model(system, direction, start, y0)
+    stepper = Stepper(solver)
+    max_events = max_events if model.slots else 0
+    state, result = _start(model, start, y0, given)
+    f0 = model.flow(start, y0, state)
+
+    degree = None
+    if model.slots and not is_affine(lambda ty: model.guards(*ty, state), (start, y0)):
+        degree = max(8, stepper.degree + 3)
+    terms = dfx.ODETerm(lambda t, y, args: model.flow(t, y, state))
+    first, controller_state = controller.init(
+        terms, start, stop, y0, dt0, None, solver.func, solver.error_order(terms)
+    )
+    saved = Saved(saveat, max_steps, max_events, start, y0, state.mode, stepper.degree, system)
+    request = saveat.subs
+    if request.t0:
+        saved = saved.write(True, start, y0, state.mode, system, direction)
+    if request.ts is not None:
+        blank = jax.tree.map(lambda x: jnp.stack([x] * (stepper.degree + 1)), y0)
+        saved = saved.write_times(jnp.ones((), bool), start, start, blank, state.mode, system, direction)
+    flow = _Flow(
+        model=model,
+        stepper=stepper,
+        controller=controller,
+        t0=start,
+        t1=stop,
+        max_steps=max_steps,
+        max_events=max_events,
+        keep_steps=request.steps,
+        want_points=saveat.dense or request.ts is not None,
+        meter=meter,
+        degree=degree,
+    )
+    zero = jnp.zeros((), jnp.int32)
+    bad = ~jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((y0, f0, start, stop))]).all()
+    result = RESULTS.where(bad, RESULTS.nonfinite_field, result)
+    carry = _Carry(
+        t=start,
+        y=y0,
+        f=f0,
+        state=state,
+        dt=lax.stop_gradient(first - start),
+        controller=controller_state,
+        active=(start < stop) & (result == RESULTS.successful),
+        result=result,
+        steps=zero,
+        accepted=zero,
+        events=zero,
+        halted=zero,
+        halvings=zero,
+        log=Log(max_events, y0, len(model.switches)) if model.slots else None,
+        saved=saved,
+        meter=meter.init(),
+    )
+    dynamic, static = eqx.partition(jax.tree.map(_strong, carry), eqx.is_array)
+
+    def body(dynamic: Any) -> Any:
+        new = eqx.filter(flow.body(eqx.combine(dynamic, static)), eqx.is_array)
+        return jax.tree.map(lambda old, x: x.astype(old.dtype), dynamic, new)
+
+    # `unvmap_any` keeps the predicate unbatched, so that ended lanes cost no copy of the buffers.
+    dynamic = lax.while_loop(lambda c: eqxi.unvmap_any(c.active), body, dynamic)
+    c: _Carry = eqx.combine(dynamic, static)
+    meter.close(c.meter)
+    saved = c.saved
+    if request.t1:
+        saved = saved.write(True, c.t, c.y, c.state.mode, system, direction)
+    sol = Solution(
+        system=system,
+        t0=t0,
+        t1=c.t * direction,
+        y1=c.y,
+        mode1=_row(c.state.mode),
+        ts=saved.ts,
+        ys=saved.ys,
+        modes=saved.modes,
+        events=_events(model, c, state),
+        stats={
+            "num_steps": c.steps,
+            "num_accepted_steps": c.accepted,
+            "num_rejected_steps": c.steps - c.accepted,
+            "num_events": c.events,
+            "max_steps": max_steps,
+        },
+        result=c.result,
+        dense=None if saved.dense is None else (*saved.dense, direction, c.accepted),
+    )
+    if throw:
+        sol = c.result.error_if(sol, c.result != RESULTS.successful)
+    return sol
+
+
+def _strong(x: Any) -> Any:
+    return jnp.asarray(x) if isinstance(x, (bool, int, float)) else x
+
+
+def _row(mode: tuple) -> Int[Array, " switches"]:
+    return jnp.stack(mode) if mode else jnp.zeros(0, jnp.int32)
+
+
+def _events(model: Model, c: _Carry, start: State) -> Events:
+    log = c.log or Log(0, c.y, len(model.switches))
+    table = jnp.asarray([s.switch for s in model.slots] + [-1], jnp.int32)
+    first = _row(start.mode)[None] if model.switches else jnp.zeros((1, 0), jnp.int32)
+    # The mode before an event is the one after the last; rows past the end keep their padding.
+    before = jnp.concatenate([first, log.modes])[: len(log.t)]
+    before = jnp.where(log.slot[:, None] < 0, log.modes, before)
+    return Events(
+        t=log.t,
+        switch=table[log.slot],
+        mode_before=before,
+        mode_after=log.modes,
+        y_before=log.before,
+        y_after=log.after,
+        num=c.events,
+        names=tuple(k.name for k in model.switches),
+    )
+
+
+def solve(
+    system: System,
+    t0: Any,
+    t1: Any,
+    y0: Y,
+    *,
+    mode: Mapping[str, Any] | Sequence[Any] | None = None,
+    solver: dfx.AbstractSolver = dfx.Tsit5(),
+    stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    saveat: dfx.SaveAt = dfx.SaveAt(t1=True),
+    dt0: Any = None,
+    max_steps: int = 4096,
+    max_events: int = 256,
+    throw: bool = True,
+    progress_meter: dfx.AbstractProgressMeter = dfx.NoProgressMeter(),
+) -> Solution:
+    """Solves y' = f(t, y, s), s_k in Sgn(h_k(t, y)), from `t0` to `t1` (which may lie before it), event by event.
+
+    Between events the field is smooth and `solver` steps it; every event is located to the accuracy of the method;
+    after it the solution crosses, slides (2.19), sticks, switches or rebounds. Derivatives by `jax.jvp` / `jax.jacfwd`
+    with respect to `y0`, `t0`, `t1` and the parameters of `system` are those of the flow, saltation (3.30) included;
+    so are those of event times.
+
+    **Arguments:**
+
+    - `system`: the model.
+    - `t0`, `t1`: start and end [time].
+    - `y0`: the state at `t0`, any pytree of floating point arrays of one dtype.
+    - `mode`: for a start on a surface, `{"name": value}` or one value for each switch: `sgn` +1, -1, or 0 to slide (also
+        on a repulsive surface); `relay` 0 or 1 (needed between its two surfaces, 0 by default).
+    - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, or Euler.
+    - `stepsize_controller`: by default `diffrax.PIDController` with `rtol = atol = 1e-8` (1e-5 for float32).
+    - `saveat`: as in diffrax: `t0`, `t1`, `ts`, `steps`, `fn(t, y, system)`, `dense`.
+    - `dt0`: first step; chosen automatically by default.
+    - `max_steps`, `max_events`: bounds, also the capacity of dense output and of the event log.
+    - `throw`: whether a failure raises; if not, look at `Solution.result`, which has one entry a lane under `vmap`.
+    - `progress_meter`: as in diffrax.
+
+    **Returns:** a `Solution`.
+
+    **Raises:** `TypeError`, `ValueError` for mistakes in the model or the arguments; a runtime error that tells which of
+    `RESULTS` occurred, if `throw`.
+    """
+    y0, t0, t1, controller, given = check_solve(
+        system, t0, t1, y0, mode, solver, stepsize_controller, saveat, max_steps, max_events
+    )
+    system = arrays_of(system, t0.dtype)
+    if dt0 is not None:
+        dt0 = jnp.abs(jnp.asarray(dt0, t0.dtype))
+    return _run(
+        system, t0, t1, y0, given, solver, controller, saveat, dt0, max_steps, max_events, throw, progress_meter
+    )
