@@ -57,6 +57,18 @@ def deflate(c: Float[Array, "... coefficients"], roots: Int[Array, "..."]) -> Fl
     return jnp.where(roots == 0, c, jnp.where(roots == 1, first, once(first)))
 
 
+@ft.lru_cache
+def elevate(degree: int, to: int) -> np.ndarray:
+    """Matrix that raises the degree of a polynomial in Bernstein form."""
+    matrix = np.eye(degree + 1)
+    for n in range(degree + 1, to + 1):
+        j = np.arange(n + 1)[:, None] / n
+        padded = np.zeros((n + 2, degree + 1))
+        padded[1:-1] = matrix
+        matrix = j * padded[:-1] + (1 - j) * padded[1:]
+    return matrix
+
+
 def no_root(c: Float[Array, "... parts coefficients"]) -> Bool[Array, "..."]:
     """Whether the maximum over the parts is certainly positive on the whole step."""
     return jnp.any(jnp.all(c > 0, axis=-1), axis=-1)

@@ -59,7 +59,7 @@ class _Residual(eqx.Module):
     def __call__(self, te: Scalar, args: tuple) -> Scalar:
         model, t, y, f0, state, slot, part = args
         y_end, *_ = self.stepper(lambda t, y: model.flow(t, y, state), t, te, y, f0)
-        return model.guards(te, y_end, state)[slot, part]
+        return model.stacked(model.guards(te, y_end, state), -1.0)[slot, part]
 
 
 def locate(
@@ -90,7 +90,7 @@ def locate(
 
     y_guess, *_ = stepper(flow, frozen[1], guess, frozen[2], frozen[3])
     values, rates = jax.jvp(
-        lambda t, y: frozen[0].guards(t, y, state), (guess, y_guess), (jnp.ones_like(guess), flow(guess, y_guess))
+        lambda t, y: model.stacked(frozen[0].guards(t, y, state), -1.0), (guess, y_guess), (jnp.ones_like(guess), flow(guess, y_guess))
     )
     part = jnp.argmax(values, axis=-1)
     value = jnp.take_along_axis(values, part[:, None], axis=-1)[:, 0]
@@ -204,9 +204,9 @@ def land(
             assert guards is not None
             first = next(i for i, s in enumerate(model.slots) if s.switch == k)
             noise = model.rounding(
-                lambda t, y, first=first: (model.guards(t, y, state_after)[first, 0],), te, after
+                lambda t, y, first=first: (model.guards(t, y, state_after)[first][0],), te, after
             )[0]
-            roots[k] = jnp.where(fired[k], jnp.abs(guards[first, 0]) <= noise, roots[k]).astype(jnp.int32)
+            roots[k] = jnp.where(fired[k], jnp.abs(guards[first][0]) <= noise, roots[k]).astype(jnp.int32)
         elif isinstance(switch, impact):
             t_after, after, roots[k], failed = _rebounded(
                 model, k, fired[k], t_start, te, before, state, t_after, after, state_after, roots[k]

@@ -184,7 +184,9 @@ class Model(eqx.Module):
     def width(self) -> int:
         return max(self.parts, default=1)
 
-    def guards(self, t: Scalar, y: Y, state: State) -> Float[Array, "slots parts"]:
+    def guards(self, t: Scalar, y: Y, state: State) -> list[list[Scalar]]:
+        """`guards[slot][part]`, as scalars: stacked arrays of length two or five cost XLA's CPU code several times as
+        much."""
         one = jnp.ones((), t.dtype)
         s = self.values(t, y, state) if self.slidable else ()
         rows = []
@@ -202,8 +204,13 @@ class Model(eqx.Module):
                 row = [jnp.where(mode == 0, one, mode * self.h(k, t, y)[0])]
             else:
                 row = self._corner_guard(slot, t, y, state)
-            rows.append(jnp.stack(row + [-one] * (self.width - len(row))))
-        return jnp.stack(rows) if rows else jnp.zeros((0, 1), t.dtype)
+            rows.append(row)
+        return rows
+
+    def stacked(self, rows: list[list[Any]], filler: float) -> Array:
+        """The same as an array `(slots, parts, ...)`; slots with fewer parts are filled up."""
+        like = jnp.full_like(rows[0][0], filler)
+        return jnp.stack([jnp.stack(row + [like] * (self.width - len(row))) for row in rows])
 
     def _corner_guard(self, slot: Slot, t: Scalar, y: Y, state: State) -> list[Scalar]:
         """h = min(h_1, ..., h_J). Where h > 0 each component is watched alone; where h < 0 the event is the instant at
@@ -216,25 +223,25 @@ class Model(eqx.Module):
             return [jnp.where(mode < 0, -h[0], alone)] + [jnp.where(mode < 0, -hi, -one) for hi in h[1:]]
         return [jnp.where(mode < 0, one, alone)]
 
-    def known_roots(self, state: State) -> Int[Array, "slots parts"]:
+    def known_roots(self, state: State) -> list[list[Int[Array, ""]]]:
         """How many roots each guard has at the present instant (just left, so not to be found again)."""
         rows = []
-        for slot in self.slots:
-            k = slot.switch
-            row = [jnp.zeros((), jnp.int32)] * self.width
+        none = jnp.zeros((), jnp.int32)
+        for k, j, sliding in self.slots:
             roots, mode, part = state.roots[k], state.mode[k], state.part[k]
-            if not slot.sliding and part is None:
-                row[0] = roots
-            elif not slot.sliding and isinstance(self.switches[k], sgn):
-                here = jnp.where(part == slot.part, roots, 0)
-                row[0] = jnp.where(mode < 0, jnp.where(part == 0, roots, 0) if slot.part == 0 else 0, here)
-                if slot.part == 0:
-                    for j in range(1, self.parts[k]):
-                        row[j] = jnp.where((mode < 0) & (part == j), roots, 0)
-            elif not slot.sliding:
-                row[0] = jnp.where(part == slot.part, roots, 0)
-            rows.append(jnp.stack(row))
-        return jnp.stack(rows) if rows else jnp.zeros((0, 1), jnp.int32)
+            if sliding:
+                row = [none]
+            elif part is None:
+                row = [roots]
+            elif isinstance(self.switches[k], impact):
+                row = [jnp.where(part == j, roots, none)]
+            elif j == 0:
+                row = [jnp.where((part == 0) | (mode < 0) & (part == i), roots, none) for i in range(self.parts[k])]
+                row[1:] = [jnp.where(mode < 0, r, none) for r in row[1:]]
+            else:
+                row = [jnp.where((mode >= 0) & (part == j), roots, none)]
+            rows.append(row)
+        return rows
 
     def rounding(self, fn: Any, t: Scalar, y: Y) -> Array:
         """What rounding of time and state alone can make of the entries of `fn(t, y)`: below it they count as zero."""

@@ -16,12 +16,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._check import check_model, check_solve
-from ._crossing import deflate, no_root, nodes, to_bernstein, to_chebyshev
+from ._crossing import deflate, elevate, nodes, to_bernstein, to_chebyshev
 from ._event import Landing, land
 from ._filippov import Model, State
 from ._save import Log, Saved
 from ._solution import Events, RESULTS, Solution
-from ._step import bernstein, Stepper
+from ._step import stack, Stepper
 from ._structure import is_affine
 from ._system import arrays_of, impact, relay, sgn, System
 from ._types import Mode, Scalar, Y
@@ -128,25 +128,56 @@ class _Flow(eqx.Module):
     keep_steps: int = eqx.field(static=True)
     want_points: bool = eqx.field(static=True)
     meter: dfx.AbstractProgressMeter
-    degree: int | None = eqx.field(static=True)  # of guards that are not affine in (t, y); None if they are
+    affine: tuple[bool, ...] = eqx.field(static=True)  # whether each guard is affine in (t, y)
+    degree: int = eqx.field(static=True)  # of the polynomial for one that is not
 
     def coefficients(
         self, t: Scalar, t_next: Scalar, y: Y, y1: Y, ks: list[Y], state: State
-    ) -> tuple[Float[Array, "slots parts coefficients"], Bool[Array, ""]]:
-        """Bernstein coefficients of the guards along a step, and whether they represent them well enough."""
-        if self.degree is None:
+    ) -> tuple[list[list[list[Scalar]]], Bool[Array, ""]]:
+        """Bernstein coefficients `[slot][part][j]` of the guards along a step, and whether they represent them well.
+
+        A guard affine in (t, y) has its values at the control points as coefficients; any other is interpolated, and
+        the size of its last Chebyshev coefficients tells whether a polynomial of that degree can stand for it.
+        """
+        out: list[list[list[Scalar]]] = [[] for _ in self.model.slots]
+        resolved = jnp.ones((), bool)
+        dt = t_next - t
+        if any(self.affine):
             n = self.stepper.degree
-            points = self.stepper.points(y, y1, ks)
-            times = t + (t_next - t) * jnp.arange(n + 1) / n
-            values = jax.vmap(lambda t, y: self.model.guards(t, y, state))(times, points)
-            return jnp.moveaxis(values, 0, -1), jnp.ones((), bool)
-        n = self.degree
-        times = t + (t_next - t) * jnp.asarray(nodes(n), t.dtype)
-        values = jax.vmap(lambda t, y: self.model.guards(t, y, state))(times, self.stepper.samples(y, y1, ks, n))
-        values = jnp.moveaxis(values, 0, -1)
-        tail = jnp.abs(values @ jnp.asarray(to_chebyshev(n)[-2:].T, t.dtype)).max(-1)
-        resolved = jnp.all(tail <= 1e-7 * jnp.max(jnp.abs(values), axis=-1))
-        return values @ jnp.asarray(to_bernstein(n).T, t.dtype), resolved
+            rows = [
+                self.model.guards(t + dt * (j / n), point, state)
+                for j, point in enumerate(self.stepper.points(y, y1, ks))
+            ]
+            for i, affine in enumerate(self.affine):
+                if affine:
+                    out[i] = [list(c) for c in zip(*[row[i] for row in rows])]
+        if not all(self.affine):
+            n = self.degree
+            at = [float(u) for u in nodes(n)]
+            samples = self.stepper.samples(y, y1, ks, n)
+            rows = [self.model.guards(t + dt * u, point, state) for u, point in zip(at, samples)]
+            for i, affine in enumerate(self.affine):
+                if affine:
+                    continue
+                for values in zip(*[row[i] for row in rows]):
+                    v = jnp.stack(values)
+                    tail = jnp.max(jnp.abs(jnp.asarray(to_chebyshev(n)[-2:], t.dtype) @ v))
+                    resolved = resolved & ~(tail > 1e-7 * jnp.max(jnp.abs(v)))
+                    out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ v))
+        return out, resolved
+
+    def stacked(self, coefficients: list[list[list[Scalar]]]) -> Float[Array, "slots parts coefficients"]:
+        """The same as one array, of one degree, known roots at the start of the step divided out of it."""
+        n = self.stepper.degree if all(self.affine) else self.degree
+        dtype = self.t0.dtype
+        rows = [
+            [
+                jnp.stack(c) if len(c) == n + 1 else jnp.asarray(elevate(len(c) - 1, n), dtype) @ jnp.stack(c)
+                for c in row
+            ]
+            for row in coefficients
+        ]
+        return self.model.stacked(rows, -1.0)
 
     def body(self, c: _Carry) -> _Carry:
         model, stepper = self.model, self.stepper
@@ -166,7 +197,7 @@ class _Flow(eqx.Module):
 
         if model.slots:
             coefficients, resolved = self.coefficients(c.t, t_next, c.y, y1, ks, c.state)
-            finite = jnp.all(jnp.isfinite(coefficients))
+            finite, quiet = _survey(coefficients, model.known_roots(c.state))
             result = RESULTS.where(keep & ~finite, RESULTS.nonfinite_field, result)
             # A guard that is no polynomial to the precision needed is not trusted: a shorter step is. (At most so
             # often: one with a kink never is.)
@@ -174,8 +205,7 @@ class _Flow(eqx.Module):
             halvings = jnp.where(poor, halvings + 1, jnp.where(keep, 0, halvings))
             keep = keep & ~poor
             dt = jnp.where(poor, 0.5 * (t_next - c.t), dt)
-            coefficients = deflate(coefficients, model.known_roots(c.state))
-            busy = c.active & keep & finite & ~jnp.all(no_root(coefficients))
+            busy = c.active & keep & finite & ~quiet
         keep = keep & c.active
 
         y_end = model.project(t_next, y1, c.state)
@@ -185,14 +215,16 @@ class _Flow(eqx.Module):
         events, halted, log = c.events, c.halted, c.log
         t_stop, points, before = t_next, None, y1
         if self.want_points:
-            points = stepper.points(c.y, y1, ks)
+            points = stack(stepper.points(c.y, y1, ks))
         if model.slots:
             still = Landing(
                 event, t_next, t_next, y1, y_end, c.state, jnp.zeros((), jnp.int32), event, ks, RESULTS.successful
             )
 
             def at_event() -> tuple[Landing, Y]:
-                there = land(model, stepper, self.t0, c.t, t_next, c.y, c.f, c.state, coefficients)
+                known = model.stacked(model.known_roots(c.state), 0)
+                polynomials = deflate(self.stacked(coefficients), known)
+                there = land(model, stepper, self.t0, c.t, t_next, c.y, c.f, c.state, polynomials)
                 return there, model.flow(there.t_after, there.y_after, there.state)
 
             def no_event() -> tuple[Landing, Y]:
@@ -210,7 +242,7 @@ class _Flow(eqx.Module):
             state = pick(state, state._replace(roots=tuple(jnp.zeros_like(r) for r in state.roots)))
             t_stop, before = pick((there.t, there.y_before), (t_next, y1))
             if self.want_points:
-                points = pick(stepper.points(c.y, there.y_before, there.increments), points)
+                points = pick(stack(stepper.points(c.y, there.y_before, there.increments)), points)
             log_it = event & there.news
             assert log is not None
             log = log.write(
@@ -275,6 +307,22 @@ class _Flow(eqx.Module):
         )
 
 
+def _survey(coefficients: list, known: list) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether all coefficients are finite, and whether certainly no guard has a root on the step: one of its parts is
+    positive in all coefficients but those which vanish with its known roots."""
+    finite = quiet = jnp.ones((), bool)
+    for row, roots in zip(coefficients, known):
+        clear = jnp.zeros((), bool)
+        for c, r in zip(row, roots):
+            positive = jnp.ones((), bool)
+            for j, value in enumerate(c):
+                positive = positive & ((value > 0) | (j < r) if j < 2 else value > 0)
+            clear = clear | positive
+            finite = finite & jnp.isfinite(sum(c))
+        quiet = quiet & clear
+    return finite, quiet
+
+
 def _cond(pred: Any, yes: Any, no: Any) -> Any:
     """`lax.cond` for branches whose results hold static leaves."""
     dynamic_yes = lambda: eqx.filter(yes(), eqx.is_array)  # noqa: E731
@@ -308,9 +356,9 @@ def _run(
     state, result = _start(model, start, y0, given)
     f0 = model.flow(start, y0, state)
 
-    degree = None
-    if model.slots and not is_affine(lambda ty: model.guards(*ty, state), (start, y0)):
-        degree = max(8, stepper.degree + 3)
+    affine = tuple(
+        is_affine(lambda ty, i=i: model.guards(*ty, state)[i], (start, y0)) for i in range(len(model.slots))
+    )
     terms = dfx.ODETerm(lambda t, y, args: model.flow(t, y, state))
     first, controller_state = controller.init(
         terms, start, stop, y0, dt0, None, solver.func, solver.error_order(terms)
@@ -333,7 +381,8 @@ def _run(
         keep_steps=request.steps,
         want_points=saveat.dense or request.ts is not None,
         meter=meter,
-        degree=degree,
+        affine=affine,
+        degree=max(8, stepper.degree + 3),
     )
     zero = jnp.zeros((), jnp.int32)
     bad = ~jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((y0, f0, start, stop))]).all()

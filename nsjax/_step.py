@@ -110,7 +110,7 @@ class Stepper(eqx.Module):
             return jax.tree.map(lambda k: k / safe, ks[-1])
         return f(t, y)
 
-    def _weighted(self, matrix: np.ndarray, y: Y, y1: Y, ks: list[Y]) -> Y:
+    def _weighted(self, matrix: np.ndarray, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
         rows = []
         for row in matrix:
             row = np.where(np.abs(row) < 1e-14, 0.0, row)
@@ -119,7 +119,7 @@ class Stepper(eqx.Module):
                 continue
             rise = jax.tree.map(lambda a, b: b - a, y, y1)
             rows.append(_combine(y, [(float(row[1]), rise)] + [(float(w), k) for w, k in zip(row[2:], ks)]))
-        return jax.tree.map(lambda *xs: jnp.stack(xs), *rows)
+        return rows
 
     def _values(self, at: np.ndarray) -> np.ndarray:
         weights, _ = _dense_weights(type(self.solver), self.stages, bool(jax.config.jax_enable_x64))
@@ -131,13 +131,18 @@ class Stepper(eqx.Module):
         few[at == 0], few[at == 1] = ends[0], ends[1]
         return few
 
-    def points(self, y: Y, y1: Y, ks: list[Y]) -> Y:
-        """Control points of the dense output: leaves gain a leading axis of length `degree + 1`."""
+    def points(self, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
+        """The `degree + 1` control points of the dense output."""
         return self._weighted(to_bernstein(self.degree) @ self._values(nodes(self.degree)), y, y1, ks)
 
-    def samples(self, y: Y, y1: Y, ks: list[Y], degree: int) -> Y:
+    def samples(self, y: Y, y1: Y, ks: list[Y], degree: int) -> list[Y]:
         """The dense output at `nodes(degree)`."""
         return self._weighted(self._values(nodes(degree)), y, y1, ks)
+
+
+def stack(points: list[Y]) -> Y:
+    """One state whose leaves have the points along a leading axis."""
+    return jax.tree.map(lambda *xs: jnp.stack(xs), *points)
 
 
 def bernstein(points: Y, u: Float[Array, ""]) -> Y:

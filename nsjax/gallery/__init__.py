@@ -1,0 +1,27 @@
+"""Every system of Leine's thesis (2000), ready to run.
+
+`thesis("6.6")` is the system of section 6.6 with the values of Appendix C; `THESIS` lists them all.
+"""
+
+from ._block import (
+    FallingFrictionBlock as FallingFrictionBlock,
+    Slip as Slip,
+    SmoothBlock as SmoothBlock,
+    StaticPointBlock as StaticPointBlock,
+)
+from ._examples import (
+    AttractionSliding as AttractionSliding,
+    Line as Line,
+    Plane as Plane,
+    RepellingPoint as RepellingPoint,
+    RepulsionSliding as RepulsionSliding,
+    SlidingPoint as SlidingPoint,
+    StickingPoint as StickingPoint,
+    TransversalIntersection as TransversalIntersection,
+)
+from ._forced import ForcedFriction as ForcedFriction, ForcedStickSlip as ForcedStickSlip
+from ._motion import Motion as Motion
+from ._stick_slip import FallingStickSlip as FallingStickSlip, StickSlip as StickSlip
+from ._support import DiscontinuousSupport as DiscontinuousSupport, Trilinear as Trilinear
+from ._table11 import BouncingBall as BouncingBall, DryFriction as DryFriction, ElasticSupport as ElasticSupport
+from ._thesis import Entry as Entry, entry as entry, OrbitGuess as OrbitGuess, THESIS as THESIS, thesis as thesis

@@ -1,0 +1,215 @@
+"""The systems of the thesis by the number of their section, equation or example."""
+
+import dataclasses
+import re
+from collections.abc import Callable, Mapping
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+from .._system import System
+from .._types import Y
+from ._block import FallingFrictionBlock, Slip, SmoothBlock, StaticPointBlock
+from ._examples import (
+    AttractionSliding,
+    Line,
+    Plane,
+    RepellingPoint,
+    RepulsionSliding,
+    SlidingPoint,
+    StickingPoint,
+    TransversalIntersection,
+)
+from ._forced import ForcedFriction, ForcedStickSlip
+from ._motion import Motion
+from ._stick_slip import FallingStickSlip, StickSlip
+from ._support import DiscontinuousSupport, Trilinear
+from ._table11 import BouncingBall, DryFriction, ElasticSupport
+
+
+@dataclasses.dataclass(frozen=True)
+class OrbitGuess:
+    """Where shooting finds the stable periodic orbit, for the default parameters."""
+
+    y0: Y  # state at t0 of the entry, away from events
+    period: float | None = None  # [s]; `None` for a forced system, where it is `order * system.period`
+    order: int = 1  # of a subharmonic orbit
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """A system of the gallery with a start that shows what it does."""
+
+    key: str
+    title: str
+    system: Callable[..., System]  # keyword arguments are parameters
+    y0: Y
+    t1: float  # end time [s]
+    t0: float = 0.0  # start time [s]
+    orbit: OrbitGuess | None = None
+
+
+# The guesses come from simulations outside this library (scipy, the mechanical reading of the friction laws), and are
+# rounded: the tests bring them back to themselves.
+_ENTRIES = (
+    Entry(
+        "1.1(1)",
+        "Elastic support, non-smooth continuous (Table 1.1)",
+        ElasticSupport,
+        y0=Motion(0.5, 0.0),
+        t1=60.0,
+        orbit=OrbitGuess(Motion(0.7975, 0.0)),  # stable, but not attracting: there is no damping
+    ),
+    Entry(
+        "1.1(2)",
+        "Dry friction damper, of Filippov type (Table 1.1)",
+        DryFriction,
+        y0=Motion(0.5, 0.5),
+        t1=60.0,
+        orbit=OrbitGuess(Motion(2.582, 0.2814)),
+    ),
+    Entry(
+        "1.1(3)",
+        "Bouncing ball, impulsive (Table 1.1)",
+        BouncingBall,
+        y0=Motion(1.0, 0.0),
+        t1=5.0,  # impacts accumulate at 9 √(2 / 9.81) s = 4.06 s
+    ),
+    Entry("(2.3)", "Attracting point of discontinuity", SlidingPoint, y0=Line(1.0), t1=2.0),
+    Entry("example 2.1", "Transversal intersection", TransversalIntersection, y0=Plane(0.0, 2.0), t1=1.0),
+    Entry("example 2.2", "Attraction sliding mode", AttractionSliding, y0=Plane(0.0, 2.0), t1=1.0),
+    # These two start beside the surface: from a point on it solutions are not unique.
+    Entry("example 2.3", "Repulsion sliding mode", RepulsionSliding, y0=Plane(0.0, 1.25), t1=1.0),
+    Entry("example 2.4", "Repelling point of discontinuity", RepellingPoint, y0=Line(0.25), t1=1.0),
+    Entry("example 2.5", "A set larger than the smallest convex one", StickingPoint, y0=Line(-1.0), t1=2.0),
+    Entry("(2.26)", "Block on a floor, smooth friction law (a)", SmoothBlock, y0=Slip(-1.0), t1=2.0),
+    Entry("(2.28)", "Block on a floor, set-valued friction law (b)", FallingFrictionBlock, y0=Slip(-1.0), t1=2.0),
+    Entry("(2.29)", "Block on a floor, static friction point (c)", StaticPointBlock, y0=Slip(-1.0), t1=2.0),
+    Entry(
+        "2.4",
+        "Stick-slip system with falling friction",
+        FallingStickSlip,
+        y0=Motion(1.1, 0.0),
+        t1=36.0,
+        orbit=OrbitGuess(Motion(1.134, 0.0), period=12.0),  # the thesis starts its shooting at x = 1.1, T = 12
+    ),
+    Entry(
+        "3.4",
+        "Stick-slip system with static friction point, undamped",
+        StickSlip,
+        y0=Motion(2.5, 0.0),
+        t1=40.0,
+        orbit=OrbitGuess(Motion(2.02, 0.0), period=13.54),
+    ),
+    Entry(
+        "3.5",
+        "Discontinuous support",
+        DiscontinuousSupport,
+        y0=Motion(0.5, 0.0),
+        t1=80.0,
+        orbit=OrbitGuess(Motion(1.110, 1.338)),
+    ),
+    Entry(
+        "6.6",
+        "Trilinear system: discontinuous fold",
+        Trilinear,
+        y0=Motion(1.1, 0.0),
+        t1=120.0,
+        orbit=OrbitGuess(Motion(-0.9007, 0.9438)),
+    ),
+    Entry(
+        "6.7",
+        "Stick-slip system with static friction point, damped: infinitely unstable orbits",
+        partial(StickSlip, c=0.1),
+        y0=Motion(2.5, 0.0),
+        t1=40.0,
+        orbit=OrbitGuess(Motion(2.0, 0.0), period=12.635),
+    ),
+    Entry(
+        "6.8",
+        "Forced vibration with dry friction: discontinuous symmetry-breaking",
+        ForcedFriction,
+        y0=Motion(3.0, 1.0),
+        t1=100.0,
+        orbit=OrbitGuess(Motion(4.013, 1.475)),
+    ),
+    Entry(
+        "6.9",
+        "Forced stick-slip system: discontinuous fold-flip",
+        ForcedStickSlip,
+        y0=Motion(1.0, 0.0),
+        t1=80.0,
+        orbit=OrbitGuess(Motion(0.1992, 0.4542), order=2),
+    ),
+)
+
+THESIS: Mapping[str, Entry] = MappingProxyType({entry.key: entry for entry in _ENTRIES})
+"""The entries by key, in the order of the thesis."""
+
+_WORDS = {
+    "": "",
+    "example": "example",
+    "ex": "example",
+    "equation": "equation",
+    "eq": "equation",
+    "section": "section",
+    "sec": "section",
+    "§": "section",
+    "table": "table",
+}
+
+
+def _parse(key: str) -> tuple[str, tuple[int, ...]] | None:
+    """Kind and numbers of a key: "Eq. (2.3)" is ("equation", (2, 3)). A bare "2.3" has the kind ""."""
+    match = re.fullmatch(r"([a-z§]*)\.?(\(?\d+\.\d+\)?)(?:\.?\(?(\d)\)?)?", "".join(key.lower().split()))
+    if match is None or match[1] not in _WORDS:
+        return None
+    kind = _WORDS[match[1]] or ("equation" if match[2].startswith("(") else "")
+    return kind, tuple(int(n) for n in re.findall(r"\d+", key))
+
+
+def _kind(entry: Entry) -> tuple[str, tuple[int, ...]]:
+    kind, numbers = _parse(entry.key)
+    return kind or ("table" if len(numbers) == 3 else "section"), numbers
+
+
+def entry(key: str) -> Entry:
+    """The entry of the gallery for `key`: start, end time and orbit guess next to the system.
+
+    **Arguments:**
+
+    - `key`: one of `THESIS`, or a sensible spelling of it: "Example 2.1", "eq 2.3", "section 6.6", "1.1.1". A bare
+      number never means an example.
+
+    **Raises:** `ValueError`, naming the possible keys.
+    """
+    asked = _parse(key)
+    for found in _ENTRIES:
+        kind, numbers = _kind(found)
+        if asked is not None and asked[1] == numbers and (asked[0] == kind or asked[0] == "" and kind != "example"):
+            return found
+    raise ValueError(f"Argument `key` must be one of {', '.join(map(repr, THESIS))}, but got {key!r}.")
+
+
+def thesis(key: str, **parameters: Any) -> System:
+    """A system of the thesis, with the values of its Appendix C where it has any.
+
+    ```python
+    system = nsjax.gallery.thesis("6.6", omega=1.3)
+    ```
+
+    **Arguments:**
+
+    - `key`: number of the section, equation or example; see `THESIS`. `entry(key)` has more than the system.
+    - `parameters`: values that replace the defaults, under the names of the thesis's symbols.
+
+    **Returns:** the `System`; its docstring states equations, sources and which values are not the thesis's.
+
+    **Raises:** `ValueError` for an unknown key or parameter.
+    """
+    system = entry(key).system
+    known = [field.name for field in dataclasses.fields(system())]
+    for name in parameters:
+        if name not in known:
+            raise ValueError(f"Argument `{name}` must be a parameter of {key!r} ({', '.join(known)}), but is none.")
+    return system(**parameters)

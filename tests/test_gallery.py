@@ -1,0 +1,347 @@
+"""The gallery against the thesis's formulas, written down here once more, case by case as the thesis prints them."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from nsjax import gallery
+from nsjax._system import impact
+
+
+KEYS = tuple(gallery.THESIS)
+C_3 = dict(m=1.0, c=0.05, k=1.0, x_c=1.0, k_f=4.0, c_f=0.5, f_0=0.2)
+APPENDIX_C = {
+    "2.4": dict(k=1.0, m=1.0, v_dr=0.2, F_s=1.0, delta=3.0),
+    "3.4": dict(k=1.0, c=0.0, m=1.0, v_dr=0.2, F_slip=1.0, F_stick=2.0),
+    "6.6": C_3,
+    "6.7": dict(k=1.0, c=0.1, m=1.0, v_dr=0.2, F_slip=1.0, F_stick=2.0),
+    "6.8": dict(m=1.0, c=0.01, k=1.0, f_0=2.5, F_slip=1.0, F_stick=2.0),
+    "6.9": dict(m=1.0, k=1.0, v_dr=1.0, alpha_0=1.5, alpha_1=1.5, alpha_3=0.45, f_0=0.1),
+}
+
+
+def state(key, *values):
+    return type(gallery.THESIS[key].y0)(*map(jnp.asarray, values))
+
+
+def field(key, t, values, s=None):
+    """The vector field as a numpy array; by default in the region of the state."""
+    system = gallery.thesis(key)
+    y = state(key, *values)
+    if s is None:
+        # The value of an impact is a force, zero between impacts.
+        s = [
+            0.0 if isinstance(k, impact) else jnp.sign(jnp.stack(k.components(system, t, y)).min())
+            for k in system.switches
+        ]
+    return np.array(system.vector_field(jnp.asarray(t), y, system.values(tuple(map(jnp.asarray, s)))))
+
+
+# The right-hand sides, with the numbers put in.
+
+
+def elastic_support(t, x, v):
+    return v, np.cos(t) - x - (4 * x if x > 0 else 0)
+
+
+def dry_friction(t, x, v):
+    return v, 2 * np.cos(0.5 * t) - x - (1 if v > 0 else -1)
+
+
+def support(t, x, v):  # (3.53), (3.54)
+    if x > 0 and 4 * x + 0.5 * v > 0:
+        return v, -5 * x - 0.5 * v + np.cos(1.2 * t)
+    return v, -x + np.cos(1.2 * t)
+
+
+def trilinear(t, x, v):  # (6.14)-(6.16)
+    stiffness, damping = x, 0.05 * v
+    if x > 1 and 4 * (x - 1) + 0.5 * v >= 0:
+        stiffness, damping = x + 4 * (x - 1), 0.55 * v
+    if x < -1 and 4 * (x + 1) + 0.5 * v <= 0:
+        stiffness, damping = x + 4 * (x + 1), 0.55 * v
+    return v, 0.2 * np.sin(1.15 * t) - stiffness - damping
+
+
+def stick_slip(t, x, v, c=0.0):  # (3.33), (3.34)
+    return v, -x - c * v - np.sign(v - 0.2)
+
+
+def falling_stick_slip(t, x, v):  # (2.30), (2.31)
+    return v, -x - np.sign(v - 0.2) / (1 + 3 * abs(v - 0.2))
+
+
+def forced_friction(t, x, v):  # (6.25), (6.26)
+    return v, -0.01 * v - x - np.sign(v) + 2.5 * np.cos(0.65 * t)
+
+
+def forced_stick_slip(t, x, v):  # (6.27), (6.28)
+    w = v - 1
+    return v, -x - 1.5 * np.sign(w) + 1.5 * w - 0.45 * w**3 + 0.1 * np.cos(1.65 * t)
+
+
+FIELDS = {
+    "1.1(1)": elastic_support,
+    "1.1(2)": dry_friction,
+    "1.1(3)": lambda t, x, v: (v, -9.81),
+    "(2.3)": lambda t, x: (3.0 if x < 0 else -1.0,),
+    "example 2.1": lambda t, x1, x2: (6, -2) if x2 > 1 else (2, -6),
+    "example 2.2": lambda t, x1, x2: (6, -2) if x2 > 1 else (2, 6),
+    "example 2.3": lambda t, x1, x2: (-6, 2) if x2 > 1 else (-2, -6),
+    "example 2.4": lambda t, x: (1.0 if x > 0 else -1.0,),
+    "example 2.5": lambda t, x: (3.0 if x > 0 else 1.0,),
+    "(2.26)": lambda t, v: (0.75 - 2 / np.pi * np.arctan(1e3 * v) * (0.5 / (1 + 3 * abs(v)) + 0.5),),
+    "(2.28)": lambda t, v: (0.75 - np.sign(v) * (0.5 / (1 + 3 * abs(v)) + 0.5),),
+    "(2.29)": lambda t, v: (0.75 - np.sign(v) * 0.5,),
+    "2.4": falling_stick_slip,
+    "3.4": stick_slip,
+    "3.5": support,
+    "6.6": trilinear,
+    "6.7": lambda t, x, v: stick_slip(t, x, v, c=0.1),
+    "6.8": forced_friction,
+    "6.9": forced_stick_slip,
+}
+
+# The mechanical reading of dry friction: belt velocity, F_ex(t, x) in stick, largest static friction force.
+STICK = {
+    "1.1(2)": (0.0, lambda t, x: x - 2 * np.cos(0.5 * t), 1.0),
+    "2.4": (0.2, lambda t, x: x, 1.0),
+    "3.4": (0.2, lambda t, x: x, 2.0),
+    "6.7": (0.2, lambda t, x: x + 0.1 * 0.2, 2.0),
+    "6.8": (0.0, lambda t, x: x - 2.5 * np.cos(0.65 * t), 2.0),
+    "6.9": (1.0, lambda t, x: x - 0.1 * np.cos(1.65 * t), 1.5),
+}
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_structure_at_every_value_of_the_switches(key):
+    entry = gallery.THESIS[key]
+    system = gallery.thesis(key)
+    y = jax.tree.map(jnp.asarray, entry.y0)
+    for s in itertools.product((-1.0, 0.0, 1.0), repeat=len(system.switches)):
+        out = system.vector_field(jnp.asarray(entry.t0), y, system.values(tuple(map(jnp.asarray, s))))
+        assert jax.tree.structure(out) == jax.tree.structure(y)
+        assert all(jnp.shape(leaf) == () and jnp.isfinite(leaf) for leaf in out)
+    assert entry.t1 > entry.t0
+    assert "\n" not in entry.title
+    assert type(system).__doc__ and ("eq. (" in type(system).__doc__ or "1.1" in key or "2.5" in key)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_fields_in_each_region(key):
+    rng = np.random.default_rng(0)
+    dimension = len(gallery.THESIS[key].y0)
+    regions = set()
+    for _ in range(40):
+        t, y = rng.uniform(0, 10), rng.uniform(-2, 2, dimension)
+        expected = FIELDS[key](t, *y)
+        np.testing.assert_allclose(field(key, t, y), expected, rtol=1e-13, atol=1e-13)
+        system = gallery.thesis(key)
+        h = [min(map(float, k.components(system, t, state(key, *y)))) for k in system.switches]
+        regions.add(tuple(np.sign(h)))
+    assert len(regions) == {0: 1, 1: 2, 2: 3}[len(system.switches)]
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_affine_in_each_switch_value(key):
+    t, y = 0.3, np.array([1.3, 0.7])[: len(gallery.THESIS[key].y0)]
+    n = len(gallery.thesis(key).switches)
+    for i in range(n):
+        at = [field(key, t, y, [value if j == i else 0.6 for j in range(n)]) for value in (-1.0, 0.5, 1.0)]
+        np.testing.assert_allclose(at[1], 0.25 * at[0] + 0.75 * at[2], atol=1e-13)
+
+
+@pytest.mark.parametrize("key", STICK)
+def test_stick_balances_the_applied_force(key):
+    v_dr, F_ex, F_stick = STICK[key]
+    system = gallery.thesis(key)
+    (switch,) = system.switches
+    slip_force = {"6.9": 1.5}.get(key, 1.0)
+    assert float(switch.bound(system)) * slip_force == F_stick
+    t, x = 0.7, 0.4
+    s = -F_ex(t, x) / slip_force
+    np.testing.assert_allclose(field(key, t, [x, v_dr], [s]), [v_dr, 0], atol=1e-14)
+
+
+def test_sliding_modes_of_chapter_2():
+    assert field("(2.3)", 0.0, [0.0], [0.5]) == 0  # (2.7)
+    np.testing.assert_allclose(field("example 2.2", 0.0, [0.0, 1.0], [0.5]), [5, 0])  # (2.19), (2.20)
+    np.testing.assert_allclose(field("example 2.3", 0.0, [0.0, 1.0], [0.5]), [-5, 0])
+    assert field("example 2.4", 0.0, [0.0], [0.0]) == 0
+    point = gallery.thesis("example 2.5")
+    assert field("example 2.5", 0.0, [0.0], [-2.0]) == 0
+    assert point.switches[0].bound(point) == 3
+    assert gallery.thesis("example 2.4").switches[0].bound(point) == 1  # the shared surface is as it was
+    for key, bound in (("(2.28)", 1.0), ("(2.29)", 2.0)):
+        block = gallery.thesis(key)
+        assert float(block.switches[0].bound(block)) == bound
+        force = block.F_s if key == "(2.28)" else block.F_d
+        np.testing.assert_allclose(field(key, 0.0, [0.0], [0.75 / force]), 0, atol=1e-15)
+
+
+@pytest.mark.parametrize("key, v", [("2.4", 0.2), ("(2.28)", 0.0)])
+@pytest.mark.parametrize("s", [-1.0, 1.0])
+def test_derivative_on_the_surface_is_that_of_the_region(key, v, s):
+    # At an event the sign of v_rel is rounding noise; the derivative must not depend on it.
+    system = gallery.thesis(key)
+    zero = [0.0] * (len(gallery.THESIS[key].y0) - 1)
+    weight = 3.0 if key == "2.4" else 3.0 * 0.5  # -F' = s δ (F_s - F_d) at v_rel = 0 and |v_rel|' = s
+    for noise in (-1e-16, 0.0, 1e-16):
+        slope = jax.jacfwd(
+            lambda v: system.vector_field(0.0, state(key, *zero, v), system.values((jnp.asarray(s),))).v
+        )(jnp.asarray(v + noise))
+        np.testing.assert_allclose(slope, weight, rtol=1e-12)
+
+
+@pytest.mark.parametrize("key", ["(2.28)", "2.4"])
+def test_falling_friction_far_from_the_surface(key):
+    # Velocities about 1/δ, where the continuation of the other region's characteristic has its pole.
+    system = gallery.thesis(key)
+    zero = [0.0] * (len(gallery.THESIS[key].y0) - 1)
+    v_dr = 0.2 if key == "2.4" else 0.0
+    for v_rel in (-1 / 3, 1 / 3, -1 / 6, 1 / 6, 1e6, -1e6):
+        np.testing.assert_allclose(field(key, 0.0, [*zero, v_dr + v_rel]), FIELDS[key](0.0, *zero, v_dr + v_rel))
+        s = system.values((jnp.sign(jnp.asarray(v_rel)),))
+        slope = jax.grad(lambda v, s: system.vector_field(0.0, state(key, *zero, v), s).v)(v_dr + v_rel, s)
+        size = 1.0 if key == "2.4" else 0.5
+        np.testing.assert_allclose(slope, size * 3 / (1 + 3 * abs(v_rel)) ** 2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("key", ["6.6", "6.8"])
+def test_symmetry(key):  # (6.24)
+    half = gallery.thesis(key).period / 2
+    for t, x, v in ((0.1, 0.3, 0.2), (2.0, 1.4, 0.5), (3.0, -1.2, 0.1), (1.0, -1.3, -0.7)):
+        np.testing.assert_allclose(field(key, t, [x, v]), -field(key, t + half, [-x, -v]), rtol=1e-12)
+
+
+def test_supports_touch_where_the_contact_force_pushes():
+    for key, x_c in (("3.5", 0.0), ("6.6", 1.0)):
+        system = gallery.thesis(key)
+        switch = system.switches[0]
+        gap, force = switch.components(system, 0.0, state(key, x_c + 0.1, -1.0))
+        np.testing.assert_allclose([gap, force], [0.1, 4 * 0.1 - 0.5])  # (3.46), (3.47), (6.17): about to leave
+    system = gallery.thesis("6.6")
+    gap, force = system.switches[1].components(system, 0.0, state("6.6", -1.1, 1.0))
+    np.testing.assert_allclose([gap, force], [0.1, 4 * 0.1 - 0.5])
+
+
+def test_ball_feels_the_floor():
+    system = gallery.thesis("1.1(3)", m=2.0)
+    (switch,) = system.switches
+    assert isinstance(switch, impact) and switch.restitution_fn(system) == 0.8
+    y = gallery.Motion(jnp.asarray(0.0), jnp.asarray(0.0))
+    resting = system.vector_field(0.0, y, system.values((jnp.asarray(2.0 * 9.81),)))
+    assert resting.v == 0
+
+
+@pytest.mark.parametrize("key", APPENDIX_C)
+def test_values_of_appendix_c(key):
+    system = gallery.thesis(key)
+    assert {name: getattr(system, name) for name in APPENDIX_C[key]} == APPENDIX_C[key]
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_period(key):
+    system = gallery.thesis(key)
+    if not hasattr(system, "omega"):
+        assert system.period is None
+        return
+    np.testing.assert_allclose(system.period, 2 * np.pi / system.omega)
+    np.testing.assert_allclose(gallery.thesis(key, omega=0.5).period, 4 * np.pi)
+    y = [0.3, 0.4]
+    np.testing.assert_allclose(field(key, 0.2, y), field(key, 0.2 + system.period, y), rtol=1e-12)
+
+
+def outside_flow(key, y, t1):
+    """scipy on the formulas above; dry friction by its mechanical reading."""
+    if key not in STICK:
+        return solve_ivp(lambda t, y: FIELDS[key](t, *y), (0, t1), y, rtol=1e-8, atol=1e-10, max_step=0.2).y[:, -1]
+    v_dr, F_ex, F_stick = STICK[key]
+
+    def slip(t, y, side):  # the field of this side, also where a trial step has gone over to the other
+        return FIELDS[key](t, y[0], v_dr + side * max(side * (y[1] - v_dr), 1e-12))
+
+    def stick(t, y, side):
+        return v_dr, 0.0
+
+    def end_of_slip(t, y, side):
+        return side * (y[1] - v_dr)
+
+    def end_of_stick(t, y, side):
+        return F_stick - abs(F_ex(t, y[0]))
+
+    for event in (end_of_slip, end_of_stick):
+        event.terminal, event.direction = True, -1
+    t, sticks, side = 0.0, False, np.sign(y[1] - v_dr)
+    while t < t1:
+        rhs, event = (stick, end_of_stick) if sticks else (slip, end_of_slip)
+        arc = solve_ivp(rhs, (t, t1), y, events=event, args=(side,), rtol=1e-8, atol=1e-10, max_step=0.2)
+        t, y = arc.t[-1], arc.y[:, -1]
+        if arc.status == 1:
+            y[1] = v_dr
+            sticks = not sticks and abs(F_ex(t, y[0])) <= F_stick
+            side = -np.sign(F_ex(t, y[0]))
+    return y
+
+
+@pytest.mark.parametrize("key", [key for key, entry in gallery.THESIS.items() if entry.orbit is not None])
+def test_orbit_guess_returns_to_itself(key):
+    guess = gallery.THESIS[key].orbit
+    period = gallery.thesis(key).period
+    time = guess.period if period is None else guess.order * float(period)
+    assert (guess.period is None) == (period is not None)
+    np.testing.assert_allclose(outside_flow(key, np.array(guess.y0), time), guess.y0, atol=5e-3)
+    if guess.order == 2:
+        assert np.linalg.norm(outside_flow(key, np.array(guess.y0), time / 2) - guess.y0) > 0.1
+
+
+def test_period_of_3_4():
+    entry = gallery.entry("3.4")
+    assert abs(entry.orbit.period - (10 + np.pi + 2 * np.arctan(1 / 5))) < 5e-3
+    np.testing.assert_allclose(entry.orbit.y0.x, 1 + np.sqrt(1.04), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "spelling, key",
+    [
+        ("Example 2.1", "example 2.1"),
+        ("ex. 2.4", "example 2.4"),
+        ("eq 2.3", "(2.3)"),
+        ("2.3", "(2.3)"),
+        ("Equation (2.28)", "(2.28)"),
+        ("1.1.1", "1.1(1)"),
+        ("Table 1.1 (3)", "1.1(3)"),
+        ("2.4", "2.4"),
+        ("Section 6.6", "6.6"),
+        ("§6.9", "6.9"),
+    ],
+)
+def test_spellings(spelling, key):
+    assert gallery.entry(spelling) is gallery.THESIS[key]
+
+
+@pytest.mark.parametrize("key", ["2.1", "2.1e", "(2.4)", "section 2.3", "example 2.6", "1.1", "1.1(4)", "6.66", ""])
+def test_unknown_key(key):
+    with pytest.raises(ValueError, match="Argument `key` must be one of '1.1\\(1\\)'.*'6.9', but got") as error:
+        gallery.thesis(key)
+    assert "\n" not in str(error.value)
+
+
+def test_parameters():
+    assert gallery.thesis("6.7").c == 0.1
+    assert gallery.thesis("6.7", c=0.2, v_dr=1.0).c == 0.2
+    assert gallery.thesis("3.4").c == 0.0
+    with pytest.raises(ValueError, match="Argument `zeta` must be a parameter of '6.6' \\(m, c, k,"):
+        gallery.thesis("6.6", zeta=0.1)
+
+
+def test_entries_are_frozen_and_ordered():
+    assert KEYS[0] == "1.1(1)" and KEYS[-1] == "6.9" and len(KEYS) == 19
+    with pytest.raises(TypeError):
+        gallery.THESIS["6.6"] = None
+    with pytest.raises(AttributeError):
+        gallery.THESIS["6.6"].key = "6.7"
