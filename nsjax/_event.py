@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ._crossing import first_root
 from ._filippov import Model, State
 from ._solution import RESULTS
-from ._step import Stepper
+from ._step import stack, Stepper
 from ._system import impact, relay, sgn
 from ._types import Scalar, Y
 
@@ -24,10 +24,11 @@ class Landing(NamedTuple):
     t_after: Scalar  # the same, but for an accumulation of impacts that was completed
     y_before: Y
     y_after: Y
+    f_after: Y
     state: State
     slot: Int[Array, ""]
     news: Bool[Array, ""]  # whether anything changed, so that it belongs into the log
-    increments: list[Y]
+    points: Y | None  # control points of the step to the event, if asked for
     result: RESULTS
 
 
@@ -143,6 +144,7 @@ def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> Y:
 def land(
     model: Model,
     stepper: Stepper,
+    want_points: bool,
     t_start: Scalar,
     t: Scalar,
     t_next: Scalar,
@@ -217,7 +219,9 @@ def land(
     news = jnp.zeros((), bool)
     for k, switch in enumerate(model.switches):
         news = news | (fired[k] if isinstance(switch, impact) else state_after.mode[k] != state.mode[k])
-    return Landing(found, te, t_after, before, after, state_after, slot, news, increments, result)
+    points = stack(stepper.points(y, before, increments)) if want_points else None
+    f_after = model.flow(t_after, after, state_after)
+    return Landing(found, te, t_after, before, after, f_after, state_after, slot, news, points, result)
 
 
 def _rebounded(

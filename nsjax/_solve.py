@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._check import check_model, check_solve
+from ._compact import compact_cond
 from ._crossing import deflate, elevate, nodes, to_bernstein, to_chebyshev
 from ._event import Landing, land
 from ._filippov import Model, State
@@ -179,6 +180,14 @@ class _Flow(eqx.Module):
         ]
         return self.model.stacked(rows, -1.0)
 
+    def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State) -> Landing:
+        """The step once more, to its first event."""
+        y1, _, ks, _ = self.stepper(lambda t, y: self.model.flow(t, y, state), t, t_next, y, f)
+        coefficients, _ = self.coefficients(t, t_next, y, y1, ks, state)
+        known = self.model.stacked(self.model.known_roots(state), 0)
+        polynomials = deflate(self.stacked(coefficients), known)
+        return land(self.model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials)
+
     def body(self, c: _Carry) -> _Carry:
         model, stepper = self.model, self.stepper
 
@@ -217,32 +226,23 @@ class _Flow(eqx.Module):
         if self.want_points:
             points = stack(stepper.points(c.y, y1, ks))
         if model.slots:
+            here = (c.t, t_next, c.y, c.f, c.state)
             still = Landing(
-                event, t_next, t_next, y1, y_end, c.state, jnp.zeros((), jnp.int32), event, ks, RESULTS.successful
+                event, t_next, t_next, y1, y_end, f_end, c.state, jnp.zeros((), jnp.int32), event, points, RESULTS.successful
             )
-
-            def at_event() -> tuple[Landing, Y]:
-                known = model.stacked(model.known_roots(c.state), 0)
-                polynomials = deflate(self.stacked(coefficients), known)
-                there = land(model, stepper, self.t0, c.t, t_next, c.y, c.f, c.state, polynomials)
-                return there, model.flow(there.t_after, there.y_after, there.state)
-
-            def no_event() -> tuple[Landing, Y]:
-                return still, f_end
-
-            there, f_there = _cond(eqxi.unvmap_any(busy), at_event, no_event)
+            there = _landed(busy, self, here, still)
             event = busy & there.found
 
             def pick(x: Any, y: Any) -> Any:
                 return jax.tree.map(lambda a, b: jnp.where(event, a, b), x, y)
 
             t, y, f, state = pick(
-                (there.t_after, there.y_after, f_there, there.state), (t_next, y_end, f_end, c.state)
+                (there.t_after, there.y_after, there.f_after, there.state), (t_next, y_end, f_end, c.state)
             )
             state = pick(state, state._replace(roots=tuple(jnp.zeros_like(r) for r in state.roots)))
             t_stop, before = pick((there.t, there.y_before), (t_next, y1))
             if self.want_points:
-                points = pick(stack(stepper.points(c.y, there.y_before, there.increments)), points)
+                points = pick(there.points, points)
             log_it = event & there.news
             assert log is not None
             log = log.write(
@@ -323,12 +323,16 @@ def _survey(coefficients: list, known: list) -> tuple[Bool[Array, ""], Bool[Arra
     return finite, quiet
 
 
-def _cond(pred: Any, yes: Any, no: Any) -> Any:
-    """`lax.cond` for branches whose results hold static leaves."""
-    dynamic_yes = lambda: eqx.filter(yes(), eqx.is_array)  # noqa: E731
-    dynamic_no = lambda: eqx.filter(no(), eqx.is_array)  # noqa: E731
-    static = eqx.filter(no(), eqx.is_array, inverse=True)
-    return eqx.combine(lax.cond(pred, dynamic_yes, dynamic_no), static)
+def _landed(pred: Any, flow: _Flow, here: tuple, default: Landing) -> Landing:
+    """`flow.land(*here)` for lanes with work to do, else `default`."""
+    dynamic, static = eqx.partition((flow, here), eqx.is_array)
+    dynamic_default, static_default = eqx.partition(default, eqx.is_array)
+
+    def branch(dynamic: Any) -> Any:
+        flow, here = eqx.combine(dynamic, static)
+        return eqx.filter(flow.land(*here), eqx.is_array)
+
+    return eqx.combine(compact_cond(pred, branch, (dynamic,), dynamic_default), static_default)
 
 
 @eqx.filter_jit

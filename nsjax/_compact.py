@@ -1,0 +1,126 @@
+"""Work that only a few lanes of a batch need: a `cond` whose branch is run for these lanes alone.
+
+Under `vmap` a `lax.cond` becomes a `select`, and every lane pays for the branch; a branch on `any(...)` is skipped only
+while no lane at all has work. Here the lanes that do have work are gathered into groups, so that the cost is that of
+the work done. The rule survives `jvp` and nested `vmap` in any order.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.extend.core as jex
+import jax.lax as lax
+import jax.numpy as jnp
+from jax.interpreters import ad, batching, mlir
+
+
+_GROUP = 32  # lanes worked on together
+
+
+compact_cond_p = jex.Primitive("compact_cond")
+compact_cond_p.multiple_results = True
+
+
+def compact_cond(pred: Any, branch: Callable[..., Any], args: Any, default: Any) -> Any:
+    """`branch(*args)` if `pred`, else `default`, both pytrees of arrays of the same structure."""
+    flat, tree = jax.tree.flatten(args)
+    closed, out = jax.make_jaxpr(lambda *xs: branch(*jax.tree.unflatten(tree, xs)), return_shape=True)(*flat)
+    other = [jnp.asarray(d, o.dtype) for d, o in zip(jax.tree.leaves(default), jax.tree.leaves(out), strict=True)]
+    inputs = [*closed.consts, *flat]
+    results = compact_cond_p.bind(pred, *inputs, *other, jaxpr=jex.ClosedJaxpr(_open(closed), ()))
+    return jax.tree.unflatten(jax.tree.structure(out), results)
+
+
+def _open(closed: jex.ClosedJaxpr) -> jex.Jaxpr:
+    """The jaxpr with its constants as its first arguments."""
+    jaxpr = closed.jaxpr
+    return jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars], debug_info=None) if jaxpr.constvars else jaxpr
+
+
+def _split(args: Any, jaxpr: jex.ClosedJaxpr) -> tuple[list, list]:
+    n = len(jaxpr.in_avals)
+    return list(args[:n]), list(args[n:])
+
+
+def _impl(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr) -> list[Any]:
+    inputs, default = _split(args, jaxpr)
+    return lax.cond(pred, lambda: list(jex.jaxpr_as_fun(jaxpr)(*inputs)), lambda: default)
+
+
+def _gathered(pred: Any, inputs: list, axes: list, default: list, branch: Callable[..., Any]) -> list[Any]:
+    """Runs the branch for the lanes where `pred` holds, group by group."""
+    lanes = pred.shape[0]
+    group = min(_GROUP, lanes)
+
+    def work(carry: tuple) -> tuple:
+        pending, results = carry
+        # The first lanes that wait; where there are no more the index is `lanes`, which is dropped.
+        waits, place = lax.top_k(pending.astype(jnp.float32), group)
+        place = jnp.where(waits > 0, place, lanes)
+        part = [x if a is None else x.at[place].get(mode="clip") for x, a in zip(inputs, axes)]
+        new = jax.vmap(branch, in_axes=tuple(axes))(*part)
+        results = [r.at[place].set(n, mode="drop") for r, n in zip(results, new)]
+        return pending.at[place].set(False, mode="drop"), results
+
+    return lax.while_loop(lambda carry: jnp.any(carry[0]), work, (pred, default))[1]
+
+
+def _batch(args: Any, dims: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[Any], list[int]]:
+    size = next(x.shape[d] for x, d in zip(args, dims) if d is not None)
+    front = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims)]
+    mapped = [d is not None for d in dims]
+    pred, (inputs, default) = front[0], _split(front[1:], jaxpr)
+    axes = [0 if m else None for m in mapped[1 : 1 + len(inputs)]]
+    default = [
+        x if m else jnp.broadcast_to(x, (size, *x.shape)) for x, m in zip(default, mapped[1 + len(inputs) :])
+    ]
+    branch = jex.jaxpr_as_fun(jaxpr)
+    if mapped[0]:
+        if all(a is None for a in axes):
+            axes = [0] * len(axes)
+            inputs = [jnp.broadcast_to(x, (size, *x.shape)) for x in inputs]
+        out = _gathered(pred, inputs, axes, default, lambda *xs: list(branch(*xs)))
+    elif all(a is None for a in axes):
+        results = _impl(pred, *inputs, *[d[0] for d in default], jaxpr=jaxpr)
+        out = [jnp.broadcast_to(x, (size, *x.shape)) for x in results]
+    else:
+        out = compact_cond(pred, jax.vmap(lambda *xs: list(branch(*xs)), in_axes=tuple(axes)), tuple(inputs), default)
+    return out, [0] * len(out)
+
+
+def _jvp(primals: Any, tangents: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[Any], list[Any]]:
+    pred, (inputs, default) = primals[0], _split(primals[1:], jaxpr)
+    moves, default_moves = _split([ad.instantiate_zeros(t) for t in tangents[1:]], jaxpr)
+    smooth = [i for i, t in enumerate(moves) if jnp.issubdtype(inputs[i].dtype, jnp.inexact)]
+    kept = [i for i, d in enumerate(default) if jnp.issubdtype(d.dtype, jnp.inexact)]
+    branch = jex.jaxpr_as_fun(jaxpr)
+
+    def both(inputs: list, moves: list) -> tuple[list, list]:
+        def inexact(*xs: Any) -> list:
+            full = list(inputs)
+            for i, x in zip(smooth, xs):
+                full[i] = x
+            return list(branch(*full))
+
+        out, change = jax.jvp(inexact, tuple(inputs[i] for i in smooth), tuple(moves))
+        return out, [change[i] for i in kept]
+
+    out, change = compact_cond(
+        pred, both, (inputs, [moves[i] for i in smooth]), (default, [default_moves[i] for i in kept])
+    )
+    full: list[Any] = [ad.Zero.from_primal_value(x) for x in out]
+    for i, c in zip(kept, change):
+        full[i] = c
+    return out, full
+
+
+def _shapes(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr) -> list[Any]:
+    return list(jaxpr.out_avals)
+
+
+compact_cond_p.def_impl(_impl)
+compact_cond_p.def_abstract_eval(_shapes)
+batching.primitive_batchers[compact_cond_p] = _batch
+ad.primitive_jvps[compact_cond_p] = _jvp
+mlir.register_lowering(compact_cond_p, mlir.lower_fun(_impl, multiple_results=True))
