@@ -12,7 +12,7 @@ import jax
 import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad, batching, mlir, partial_eval as pe
 
 
 _GROUP = 32  # lanes worked on together
@@ -66,27 +66,47 @@ def _gathered(pred: Any, inputs: list, axes: list, default: list, branch: Callab
     return lax.while_loop(lambda carry: jnp.any(carry[0]), work, (pred, default))[1]
 
 
-def _batch(args: Any, dims: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[Any], list[int]]:
+def _batched_outputs(jaxpr: jex.ClosedJaxpr, batched: list[bool]) -> list[bool]:
+    """Which outputs depend on the inputs that are batched."""
+    outs = jaxpr.jaxpr.outvars
+    found = []
+    for i in range(len(outs)):
+        _, used = pe.dce_jaxpr(jaxpr.jaxpr, [i == j for j in range(len(outs))])
+        found.append(any(u and b for u, b in zip(used, batched)))
+    return found
+
+
+def _batch(args: Any, dims: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[Any], list[int | None]]:
     size = next(x.shape[d] for x, d in zip(args, dims) if d is not None)
     front = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims)]
     mapped = [d is not None for d in dims]
     pred, (inputs, default) = front[0], _split(front[1:], jaxpr)
-    axes = [0 if m else None for m in mapped[1 : 1 + len(inputs)]]
-    default = [
-        x if m else jnp.broadcast_to(x, (size, *x.shape)) for x, m in zip(default, mapped[1 + len(inputs) :])
-    ]
-    branch = jex.jaxpr_as_fun(jaxpr)
+    many, many_default = _split(mapped[1:], jaxpr)
+
+    def spread(x: Any, is_mapped: bool) -> Any:
+        return x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
+
+    def branch(*xs: Any) -> list[Any]:
+        return list(jex.jaxpr_as_fun(jaxpr)(*xs))
+
     if mapped[0]:
-        if all(a is None for a in axes):
-            axes = [0] * len(axes)
-            inputs = [jnp.broadcast_to(x, (size, *x.shape)) for x in inputs]
-        out = _gathered(pred, inputs, axes, default, lambda *xs: list(branch(*xs)))
-    elif all(a is None for a in axes):
-        results = _impl(pred, *inputs, *[d[0] for d in default], jaxpr=jaxpr)
-        out = [jnp.broadcast_to(x, (size, *x.shape)) for x in results]
-    else:
-        out = compact_cond(pred, jax.vmap(lambda *xs: list(branch(*xs)), in_axes=tuple(axes)), tuple(inputs), default)
-    return out, [0] * len(out)
+        if not any(many):
+            inputs, many = [spread(x, False) for x in inputs], [True] * len(inputs)
+        axes = [0 if m else None for m in many]
+        out = _gathered(pred, inputs, axes, [spread(x, m) for x, m in zip(default, many_default)], branch)
+        return out, [0] * len(out)
+    # All of this axis has work, or none: the branch becomes a batched one. Outputs that do not depend on the batched
+    # inputs (the primals, under `jacfwd`) must stay without the axis.
+    wide = [a or b for a, b in zip(_batched_outputs(jaxpr, many), many_default)]
+
+    def batched(*xs: Any) -> list[Any]:
+        if not any(many):
+            return [spread(x, False) if w else x for x, w in zip(branch(*xs), wide)]
+        results = jax.vmap(branch, in_axes=tuple(0 if m else None for m in many))(*xs)
+        return [x if w else x[0] for x, w in zip(results, wide)]
+
+    default = [spread(x, m) if w else x for x, m, w in zip(default, many_default, wide)]
+    return compact_cond(pred, batched, tuple(inputs), default), [0 if w else None for w in wide]
 
 
 def _jvp(primals: Any, tangents: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[Any], list[Any]]:
@@ -109,7 +129,7 @@ def _jvp(primals: Any, tangents: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[A
     out, change = compact_cond(
         pred, both, (inputs, [moves[i] for i in smooth]), (default, [default_moves[i] for i in kept])
     )
-    full: list[Any] = [ad.Zero.from_primal_value(x) for x in out]
+    full: list[Any] = [ad.Zero(jax.core.ShapedArray(x.shape, jax.dtypes.float0)) for x in out]
     for i, c in zip(kept, change):
         full[i] = c
     return out, full

@@ -1,6 +1,7 @@
 """Buffers filled while the flow runs: the states `saveat` asks for, dense output, and the event log."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -15,6 +16,23 @@ from ._types import Scalar, Y
 
 
 NO_MODE = -128  # padding of saved modes
+
+
+class Request(NamedTuple):
+    """The contents of a `SaveAt`, which may ask for dense output alone."""
+
+    t0: bool
+    t1: bool
+    ts: Float[Array, " times"] | None
+    steps: int
+    fn: Callable[..., Any]
+
+    @classmethod
+    def of(cls, saveat: dfx.SaveAt) -> "Request":
+        sub = saveat.subs
+        if sub is None:
+            return cls(False, False, None, 0, lambda t, y, system: y)
+        return cls(sub.t0, sub.t1, sub.ts, sub.steps, sub.fn)
 
 
 def _put(buffer: Any, index: Any, value: Any, when: Any) -> Any:
@@ -60,10 +78,20 @@ class Saved(eqx.Module):
     count: Any
     next: Any
     dense: Any  # (start times, end times, control points) of every accepted step
-    request: dfx.SubSaveAt = eqx.field(static=False)
+    request: Request
 
-    def __init__(self, saveat: dfx.SaveAt, max_steps: int, max_events: int, t: Scalar, y: Y, mode: tuple, degree: int, system: Any):
-        request = saveat.subs
+    def __init__(
+        self,
+        saveat: dfx.SaveAt,
+        max_steps: int,
+        max_events: int,
+        t: Scalar,
+        y: Y,
+        mode: tuple,
+        degree: int,
+        system: Any,
+    ):
+        request = Request.of(saveat)
         self.request = request
         self.count = jnp.zeros((), jnp.int32)
         self.next = jnp.zeros((), jnp.int32)
@@ -110,7 +138,13 @@ class Saved(eqx.Module):
             saved = saved.write(now, t, bernstein(points, u), mode, system, direction)
             return eqx.tree_at(lambda s: s.next, saved, saved.next + now)
 
-        return lax.while_loop(lambda s: eqxi.unvmap_any(due(s)), save, self)
+        dynamic, static = eqx.partition(self, eqx.is_array)
+        dynamic = lax.while_loop(
+            lambda d: eqxi.unvmap_any(due(eqx.combine(d, static))),
+            lambda d: eqx.filter(save(eqx.combine(d, static)), eqx.is_array),
+            dynamic,
+        )
+        return eqx.combine(dynamic, static)
 
     def write_step(self, when: Any, index: Any, t0: Scalar, t1: Scalar, points: Y) -> "Saved":
         if self.dense is None:

@@ -43,6 +43,17 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "A reset left the state on the wrong side of its surface (h < 0), or still approaching it (dh/dt < 0). Check the "
         "signs in the method decorated with `.reset` (or a coefficient of restitution below 0)."
     )
+    orbit_not_found = (
+        "No periodic orbit was found: Newton's method on the shooting equations did not converge. Start nearer to one "
+        "(`y0`, `period`), or check that the system has one."
+    )
+    orbit_is_equilibrium = (
+        "The search for a periodic orbit ended in an equilibrium. Start farther away from it, near the orbit."
+    )
+    orbit_is_multiple_cover = (
+        "The orbit found repeats itself within the period asked for. Divide `period` (or `order`) by the number of "
+        "repetitions."
+    )
 
 
 class Event(NamedTuple):

@@ -180,10 +180,8 @@ class _Flow(eqx.Module):
         ]
         return self.model.stacked(rows, -1.0)
 
-    def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State) -> Landing:
+    def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list) -> Landing:
         """The step once more, to its first event."""
-        y1, _, ks, _ = self.stepper(lambda t, y: self.model.flow(t, y, state), t, t_next, y, f)
-        coefficients, _ = self.coefficients(t, t_next, y, y1, ks, state)
         known = self.model.stacked(self.model.known_roots(state), 0)
         polynomials = deflate(self.stacked(coefficients), known)
         return land(self.model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials)
@@ -226,7 +224,7 @@ class _Flow(eqx.Module):
         if self.want_points:
             points = stack(stepper.points(c.y, y1, ks))
         if model.slots:
-            here = (c.t, t_next, c.y, c.f, c.state)
+            here = (c.t, t_next, c.y, c.f, c.state, lax.stop_gradient(coefficients))
             still = Landing(
                 event, t_next, t_next, y1, y_end, f_end, c.state, jnp.zeros((), jnp.int32), event, points, RESULTS.successful
             )
@@ -368,7 +366,7 @@ def _run(
         terms, start, stop, y0, dt0, None, solver.func, solver.error_order(terms)
     )
     saved = Saved(saveat, max_steps, max_events, start, y0, state.mode, stepper.degree, system)
-    request = saveat.subs
+    request = saved.request
     if request.t0:
         saved = saved.write(True, start, y0, state.mode, system, direction)
     if request.ts is not None:

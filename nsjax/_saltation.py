@@ -1,0 +1,151 @@
+"""Saltation matrices from their formula, an oracle independent of automatic differentiation through the flow."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ._event import rebound
+from ._filippov import Model, State
+from ._solution import Events
+from ._system import arrays_of, impact, relay, System
+from ._types import Scalar, Y
+
+
+def _float(t: Any, y: Y) -> tuple[Scalar, Y]:
+    dtype = jnp.result_type(float, *jax.tree.leaves(y)) if jax.tree.leaves(y) else jnp.result_type(float)
+    dtype = jnp.result_type(*jax.tree.leaves(y)) if not any(isinstance(x, float) for x in jax.tree.leaves(y)) else dtype
+    return jnp.asarray(t, dtype), jax.tree.map(lambda x: jnp.asarray(x, dtype), y)
+
+
+def _modes(system: System, mode: Any) -> tuple[Int[Array, ""], ...]:
+    names = [k.name for k in system.switches]
+    if isinstance(mode, Mapping):
+        missing = [n for n in names if n not in mode and not isinstance(dict(zip(names, system.switches))[n], impact)]
+        if missing or set(mode) - set(names):
+            raise ValueError(f"A mode must give a value for each of the switches {names}, but got {dict(mode)}.")
+        mode = [mode.get(n, 0) for n in names]
+    elif not isinstance(mode, Sequence) and jnp.ndim(mode) == 0:
+        mode = [mode]
+    if len(mode) != len(names):
+        raise ValueError(f"A mode must give a value for each of the switches {names}, but got {len(mode)} values.")
+    return tuple(jnp.asarray(m, jnp.int32) for m in mode)
+
+
+def _states(model: Model, t: Scalar, y: Y, mode: tuple) -> State:
+    """A mode with the component of h that is on its surface: the one nearest to zero."""
+    parts = tuple(
+        None
+        if model.parts[k] == 1 or isinstance(switch, relay)
+        else jnp.argmin(jnp.abs(jnp.stack(model.h(k, t, y)))).astype(jnp.int32)
+        for k, switch in enumerate(model.switches)
+    )
+    return State(mode, parts, tuple(jnp.zeros((), jnp.int32) for _ in mode))
+
+
+def _fired(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+    """The guard of switch k that is at zero: its surface, or while sliding the bound that λ has reached."""
+    switch = model.switches[k]
+    mode = state.mode[k]
+    if isinstance(switch, relay):
+        on = switch.guard(model.system, t, y)
+        assert switch.off_guard is not None
+        return jnp.where(mode == 1, switch.off_guard(model.system, t, y), on)
+    h = model.h(k, t, y)
+    surface = h[0] if len(h) == 1 else jnp.stack(h)[state.part[k]]
+    if k not in model.slidable:
+        return surface
+    lam = model.values(t, y, state)[k]
+    return jnp.where(mode == 0, model.bound(k) - jnp.sign(lam) * lam, surface)
+
+
+def _pieces(
+    model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple
+) -> tuple[Float[Array, " n"], Scalar, Float[Array, " n"], Float[Array, "n n"], Float[Array, " n"], Float[Array, " n"]]:
+    """n, h_t, f⁻, D R, R_t and f⁺ at an event of switch k; R is the identity but for impacts."""
+    flat, unravel = jfu.ravel_pytree(y)
+
+    def ravel(y: Y) -> Array:
+        return jfu.ravel_pytree(y)[0]
+
+    state = _states(model, t, y, before)
+    h_t, n = jax.jacfwd(lambda t, x: _fired(model, k, t, unravel(x), state), argnums=(0, 1))(t, flat)
+    f_before = ravel(model.flow(t, y, state))
+    if isinstance(model.switches[k], impact):
+        jump = lambda t, x: ravel(rebound(model, k, t, unravel(x), state))  # noqa: E731
+        r_t, dr = jax.jacfwd(jump, argnums=(0, 1))(t, flat)
+        landed = unravel(jump(t, flat))
+    else:
+        r_t, dr, landed = jnp.zeros_like(flat), jnp.eye(flat.size, dtype=flat.dtype), y
+    f_after = ravel(model.flow(t, landed, _states(model, t, landed, after)))
+    return n, h_t, f_before, dr, r_t, f_after
+
+
+def _matrix(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Float[Array, "n n"]:
+    n, h_t, f_before, dr, r_t, f_after = _pieces(model, t, y, k, before, after)
+    return dr + jnp.outer(f_after - dr @ f_before - r_t, n) / (n @ f_before + h_t)
+
+
+def saltation_matrix(
+    system: System, t: Any, y: Y, switch: str, mode_before: Any, mode_after: Any
+) -> Float[Array, "n n"]:
+    """The saltation matrix of an event, by which the fundamental matrix jumps: Φ(t+) = S Φ(t-).
+
+    S = DR + (f⁺ - DR f⁻ - R_t) nᵀ / (nᵀ f⁻ + h_t), with n = grad h: eq. (3.30) where the state does not jump (R = y)
+    and h does not depend on time, (3.32) where it does. At a tangency the denominator vanishes and S is infinite.
+
+    **Arguments:**
+
+    - `system`: the model.
+    - `t`, `y`: time and state at the event, before a jump of the state.
+    - `switch`: the name of the switch whose surface is met, or whose multiplier reaches its bound.
+    - `mode_before`, `mode_after`: the modes, as `{"name": value}`, one value a switch, or for one switch its value.
+
+    **Returns:** the matrix, for the state flattened by `ravel_pytree` (fields of a `NamedTuple` in order), in units of
+    one state component over another.
+
+    **Raises:** `ValueError` for an unknown switch.
+    """
+    names = [k.name for k in system.switches]
+    if switch not in names:
+        raise ValueError(f"Argument `switch` must be one of {', '.join(names) or 'no switches'}, but got {switch!r}.")
+    t, y = _float(t, y)
+    system = arrays_of(system, t.dtype)
+    model = Model(system, jnp.ones_like(t), t, y)
+    before, after = _modes(system, mode_before), _modes(system, mode_after)
+    return _matrix(model, t, y, names.index(switch), before, after)
+
+
+def _over_log(system: System, events: Events, fn: Any) -> Array:
+    dtype = events.t.dtype
+    system = arrays_of(system, dtype)
+    template = jax.tree.map(lambda x: x[0], events.y_before)
+    model = Model(system, jnp.ones((), dtype), jnp.zeros((), dtype), template)
+
+    def one(t: Scalar, y: Y, switch: Array, before: Array, after: Array) -> Array:
+        options = [
+            fn(model, t, y, k, tuple(before), tuple(after)) for k in range(len(model.switches))
+        ]
+        return jnp.select([switch == k for k in range(len(options))], options, jnp.nan)
+
+    return jax.vmap(one)(events.t, events.y_before, events.switch, events.mode_before, events.mode_after)
+
+
+def saltation_matrices(system: System, events: Events) -> Float[Array, "events n n"]:
+    """`saltation_matrix` of every event of a log; rows past the last event are NaN."""
+    return _over_log(system, events, _matrix)
+
+
+def transversality(system: System, events: Events) -> Float[Array, " events"]:
+    """How squarely each event of a log meets its surface: |nᵀ f⁻ + h_t| / sqrt((|n|² + h_t²) (|f⁻|² + 1)), the cosine
+    between the normal of the surface and the trajectory in time and state, from 0 (tangency, where derivatives do not
+    exist) to 1; rows past the last event are NaN."""
+
+    def cosine(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Scalar:
+        n, h_t, f, *_ = _pieces(model, t, y, k, before, after)
+        return jnp.abs(n @ f + h_t) / jnp.sqrt((n @ n + h_t**2) * (f @ f + jnp.where(h_t == 0, 0, 1)))
+
+    return _over_log(system, events, cosine)

@@ -1,0 +1,163 @@
+"""The fundamental solution matrix, by two routes that share nothing after the trajectory itself."""
+
+from typing import Any, Literal
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._check import check_solve
+from ._filippov import Model, State
+from ._saltation import _states, saltation_matrices
+from ._solution import Solution
+from ._solve import solve
+from ._system import arrays_of, System
+from ._types import Scalar, Y
+
+
+def fundamental_matrix(
+    system: System,
+    t0: Any,
+    t1: Any,
+    y0: Y,
+    *,
+    ts: Any = None,
+    method: Literal["variational", "autodiff"] = "variational",
+    mode: Any = None,
+    solver: dfx.AbstractSolver = dfx.Dopri8(),
+    stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    max_steps: int = 4096,
+    max_events: int = 64,
+    throw: bool = True,
+) -> Float[Array, "n n"] | Float[Array, "times n n"]:
+    """The fundamental solution matrix Φ(t, t0) = ∂y(t)/∂y(t0) along a solution.
+
+    `"variational"` integrates Φ' = (∂f/∂y) Φ on each smooth arc, eq. (3.5), and multiplies by the saltation matrix at
+    each event (3.30); `"autodiff"` is `jax.jacfwd` of `solve`.
+
+    **Arguments:**
+
+    - `system`, `t0`, `t1`, `y0`, `mode`, `solver`, `stepsize_controller`, `max_steps`, `max_events`, `throw`: as for
+        `solve` (here Dopri8 and, for float64, tolerances of 1e-10 by default).
+    - `ts`: times between `t0` and `t1` at which Φ is wanted (before the jump, where it falls on an event).
+    - `method`: the route.
+
+    **Returns:** Φ(t1, t0) of shape `(n, n)`, or Φ(ts, t0) of shape `(len(ts), n, n)`, for the state flattened by
+    `ravel_pytree`.
+    """
+    if method not in ("variational", "autodiff"):
+        raise ValueError(f"Argument `method` must be 'variational' or 'autodiff', but got {method!r}.")
+    y0, t0, t1, controller, _ = check_solve(
+        system, t0, t1, y0, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events
+    )
+    if stepsize_controller is None:
+        tol = 1e-10 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-5
+        controller = dfx.PIDController(rtol=tol, atol=tol)
+    kwargs: dict[str, Any] = dict(
+        mode=mode, solver=solver, stepsize_controller=controller, max_steps=max_steps, max_events=max_events, throw=throw
+    )
+    flat, unravel = jfu.ravel_pytree(y0)
+    if method == "autodiff":
+        saveat = dfx.SaveAt(t1=True) if ts is None else dfx.SaveAt(ts=jnp.asarray(ts, t0.dtype))
+
+        def flow(x: Array) -> Array:
+            ys = solve(system, t0, t1, unravel(x), saveat=saveat, **kwargs).ys
+            return jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(ys)
+
+        phi = jax.jit(jax.jacfwd(flow))(flat)
+        return phi[0] if ts is None else phi
+    sol = solve(system, t0, t1, y0, **kwargs)
+    times = jnp.asarray([t1] if ts is None else ts, t0.dtype)
+    phi = _by_arcs(arrays_of(system, t0.dtype), sol, t0, y0, times, solver, controller, max_steps)
+    return phi[0] if ts is None else phi
+
+
+def arcs(sol: Solution, t0: Scalar, y0: Y) -> tuple[Array, Array, Y, Array]:
+    """Start and end times, start states and modes of the arcs between the events of a solution; those past the last
+    event have no length."""
+    events = sol.events
+    capacity = events.t.shape[0]
+    happened = jnp.arange(capacity) < events.num
+
+    def rows(first: Any, later: Any, end: Any) -> Any:
+        def leaf(a: Array, b: Array, c: Array) -> Array:
+            held = happened.reshape((-1,) + (1,) * (b.ndim - 1))
+            return jnp.concatenate([a[None], jnp.where(held, b, c)])
+
+        return jax.tree.map(leaf, first, later, end)
+
+    begin = rows(t0, events.t, sol.t1)
+    end = jnp.concatenate([begin[1:], sol.t1[None]])
+    first = jnp.where(events.num > 0, events.mode_before[0], sol.mode1) if capacity else sol.mode1
+    return begin, end, rows(y0, events.y_after, sol.y1), rows(first, events.mode_after, sol.mode1)
+
+
+def monodromy_by_arcs(
+    system: System, sol: Solution, t0: Scalar, y0: Y, solver: Any, controller: Any, max_steps: int = 4096
+) -> Float[Array, "n n"]:
+    """Φ at the end of `sol`, by the variational equation and the saltation formula."""
+    return _by_arcs(system, sol, t0, y0, sol.t1[None], solver, controller, max_steps)[0]
+
+
+class _Arc(System):
+    """y and Φ on an arc in a fixed mode: a smooth system, Φ' = (∂f/∂y) Φ."""
+
+    model: Model
+    state: State
+
+    def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
+        y, phi = y
+        flat, unravel = jfu.ravel_pytree(y)
+
+        def rhs(x: Array) -> Array:
+            return jfu.ravel_pytree(self.model.flow(t, unravel(x), self.state))[0]
+
+        columns = jax.vmap(lambda column: jax.jvp(rhs, (flat,), (column,))[1], in_axes=1, out_axes=1)(phi)
+        return self.model.flow(t, y, self.state), columns
+
+
+@eqx.filter_jit
+def _by_arcs(
+    system: System,
+    sol: Solution,
+    t0: Scalar,
+    y0: Y,
+    times: Array,
+    solver: dfx.AbstractSolver,
+    controller: dfx.AbstractStepSizeController,
+    max_steps: int,
+) -> Float[Array, "times n n"]:
+    """Φ on the arcs between the events of `sol`, and its jumps there."""
+    flat, unravel = jfu.ravel_pytree(y0)
+    model = Model(system, jnp.ones_like(t0), t0, y0)
+    n = flat.size
+    eye = jnp.eye(n, dtype=flat.dtype)
+    begin, end, state, modes = arcs(sol, t0, y0)
+    jumps = eye[None]
+    if sol.events.t.size:
+        happened = jnp.arange(sol.events.t.size) < sol.events.num
+        later = jnp.where(happened[:, None, None], saltation_matrices(system, sol.events), eye)
+        jumps = jnp.concatenate([jumps, later])
+
+    def arc(phi: Array, row: tuple) -> tuple[Array, Array]:
+        a, b, y, mode, jump = row
+        smooth = _Arc(model, _states(model, a, y, tuple(mode)))
+        # On an arc that runs backwards so do the times.
+        low, high = jnp.minimum(a, b), jnp.maximum(a, b)
+        inside = jnp.clip(times, low, high)
+        order = jnp.argsort(jnp.where(b >= a, inside, -inside))
+        out = solve(
+            smooth, a, b, (y, jump @ phi), saveat=dfx.SaveAt(ts=inside[order]),
+            solver=solver, stepsize_controller=controller, max_steps=max_steps, throw=False,
+        )  # fmt: skip
+        return out.y1[1], jnp.zeros_like(out.ys[1]).at[order].set(out.ys[1])
+
+    _, by_arc = lax.scan(arc, eye, (begin, end, state, modes, jumps))
+    # Each time belongs to the arc that ends at or after it; the first one wins, so that Φ is that before a jump.
+    sign = jnp.where(sol.t1 >= t0, 1, -1)
+    index = jnp.clip(jnp.searchsorted(sign * end, sign * times, side="left"), 0, len(end) - 1)
+    return by_arc[index, jnp.arange(len(times))]

@@ -1,0 +1,94 @@
+"""Linearised dynamics: the fundamental solution matrix against time, and Floquet multipliers."""
+
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from .._solution import Events
+from ._style import axes_or_new, axis_label, Labels, legend
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def fundamental_matrix(
+    ts: Float[ArrayLike, " times"],
+    phi: Float[ArrayLike, "times n n"],
+    events: Events | Float[ArrayLike, " events"] | None = None,
+    *,
+    axes: "Float[np.ndarray, 'n n'] | None" = None,
+    labels: Labels = None,
+) -> np.ndarray:
+    """Draws the entries of the fundamental solution matrix Φ(t, t0) against time, one panel for each; Fig. 3.7.
+
+    **Arguments:**
+
+    - `ts`, `phi`: times and matrices, from `nsjax.fundamental_matrix(..., ts=ts)`.
+    - `events`: the log of the solution, or the times of its events; lines are cut there, so that the jumps by saltation
+        matrices show.
+    - `axes`: an array of n x n axes; by default those of a new figure.
+    - `labels`: as `{"t": "t [s]", (1, 2): "$\\Phi_{12}$ [s]"}`, counting from 1.
+
+    **Returns:** the array of axes, of shape `(n, n)`.
+
+    **Raises:** `ValueError` where the shapes do not fit.
+    """
+    ts, phi = np.asarray(ts), np.asarray(phi)
+    n = phi.shape[-1]
+    if phi.shape != (len(ts), n, n):
+        raise ValueError(f"Argument `phi` must have the shape ({len(ts)}, n, n) for these `ts`, but has {phi.shape}.")
+    if axes is None:
+        import matplotlib.pyplot as plt
+
+        size = (1.2 + 2.6 * n, 0.8 + 1.8 * n)
+        axes = plt.subplots(n, n, sharex=True, squeeze=False, figsize=size, layout="constrained")[1]
+    axes = np.asarray(axes)
+    if axes.shape != (n, n):
+        raise ValueError(f"Argument `axes` must have the shape ({n}, {n}), but has {axes.shape}.")
+    if isinstance(events, Events):
+        events = events.t[: len(events)]
+    cuts = np.zeros(0) if events is None else np.asarray(events)
+    pieces = np.split(np.arange(len(ts)), np.searchsorted(ts, cuts))
+    for (i, j), ax in np.ndenumerate(axes):
+        for piece in pieces:
+            ax.plot(ts[piece], phi[piece, i, j], color="C0")
+        for t in cuts:
+            ax.axvline(t, color="0.6", linestyle=":", linewidth=0.8, zorder=0)
+        ax.set_ylabel(axis_label(labels, (i + 1, j + 1), f"$\\Phi_{{{i + 1}{',' * (n > 9)}{j + 1}}}$"))
+        if i == n - 1:
+            ax.set_xlabel(axis_label(labels, "t"))
+    return axes
+
+
+def multipliers(orbit: Any, *, ax: "Axes | None" = None) -> "Axes":
+    """Draws the Floquet multipliers of an orbit in the complex plane, with the unit circle.
+
+    The multiplier 1 which an autonomous system always has, that of a shift along the orbit, is drawn hollow.
+
+    **Arguments:**
+
+    - `orbit`: an `Orbit`.
+    - `ax`: where to draw; by default a new figure.
+
+    **Returns:** the axes.
+    """
+    ax = axes_or_new(ax)
+    values = np.asarray(orbit.multipliers)
+    angle = np.linspace(0, 2 * np.pi, 361)
+    ax.plot(np.cos(angle), np.sin(angle), color="0.5", linewidth=1.0)
+    ax.axhline(0, color="0.85", linewidth=0.8, zorder=0)
+    ax.axvline(0, color="0.85", linewidth=0.8, zorder=0)
+    trivial = np.zeros(len(values), bool)
+    if orbit.system.period is None:
+        trivial[np.argmin(np.abs(values - 1))] = True
+    for those, fill, label in ((~trivial, "C3", "Floquet multipliers"), (trivial, "white", "along the orbit")):
+        if those.any():
+            shown = values[those]
+            ax.plot(shown.real, shown.imag, "o", markerfacecolor=fill, markeredgecolor="C3", label=label, clip_on=False)
+    ax.set_aspect("equal")
+    ax.set_xlabel("Re λ [-]")
+    ax.set_ylabel("Im λ [-]")
+    legend(ax)
+    return ax

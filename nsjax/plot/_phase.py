@@ -1,0 +1,174 @@
+"""The phase plane: trajectories with the surfaces they meet, and Poincaré sections."""
+
+from typing import Any, TYPE_CHECKING
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+
+from .._solution import Solution
+from .._structure import depends
+from .._system import AbstractSwitch, impact, relay, sgn
+from .._types import Y
+from ._path import arcs, chosen, components, solved
+from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_legend, mode_line
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+GRID = 201  # points along each axis on which the indicator functions are drawn
+
+
+def phase_portrait(
+    sol: Any,
+    x: str | None = None,
+    y: str | None = None,
+    *,
+    ax: "Axes | None" = None,
+    labels: Labels = None,
+    surfaces: bool = True,
+    events: bool = True,
+    legend: bool = True,
+    **style: Any,
+) -> "Axes":
+    """Draws a trajectory in the phase plane: coloured by mode, thick where it slides, with its events; Fig. 3.5.
+
+    For a state of two components the surfaces h = 0 are drawn as lines with the signs of h beside them, the region
+    h < 0 lightly shaded, and hatched where an impact forbids it. (A surface that moves with time is left out.)
+
+    **Arguments:**
+
+    - `sol`: a `Solution` with `SaveAt(dense=True)` (or saved states), or an `Orbit`.
+    - `x`, `y`: names of components of the state; by default the first two.
+    - `ax`: where to draw; by default a new figure.
+    - `labels`: for the axes, as `{"x": "x [m]"}`; by default the names of the components.
+    - `surfaces`, `events`: whether to draw them.
+    - `legend`: whether to explain the colours.
+    - `style`: properties of the line, as in `Axes.plot`, in place of those of the mode.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` for an unknown component, a batch of solutions, or one without states along the way.
+    """
+    sol = solved(sol)
+    x, y = chosen(components(sol.y1), [x, y])
+    ax = axes_or_new(ax)
+    for arc in arcs(sol):
+        ax.plot(arc.y[x], arc.y[y], solid_capstyle="butt", **mode_line(sol.system, arc.mode) | style)
+    if events:
+        _draw_events(ax, sol, x, y)
+    ax.set_xlabel(axis_label(labels, x))
+    ax.set_ylabel(axis_label(labels, y))
+    if surfaces and len(components(sol.y1)) == 2:
+        _draw_surfaces(ax, sol, x, y)
+    if legend:
+        add_legend(ax)
+    return ax
+
+
+def _draw_events(ax: "Axes", sol: Solution, x: str, y: str) -> None:
+    n = len(sol.events)
+    log = (sol.events.y_before, sol.events.y_after)
+    before, after = (components(jax.tree.map(lambda l: l[:n], state), ndim=1) for state in log)
+    for i in np.flatnonzero((before[x] != after[x]) | (before[y] != after[y])):
+        ax.plot([before[x][i], after[x][i]], [before[y][i], after[y][i]], **JUMP)
+    ax.plot(after[x], after[y], label="event" if n else None, **EVENT)
+
+
+def _draw_surfaces(ax: "Axes", sol: Solution, x: str, y: str) -> None:
+    xlim, ylim = ax.get_xlim(), ax.get_ylim()
+    along = [np.linspace(*lim, GRID) for lim in (xlim, ylim)]
+    plane = np.stack(np.meshgrid(*along), axis=-1)
+    # Components stand in the order in which the state is raveled.
+    if list(components(sol.y1)) != [x, y]:
+        plane = plane[..., ::-1]
+    flat, unravel = jax.flatten_util.ravel_pytree(sol.y1)
+    plane = jnp.asarray(plane, flat.dtype).reshape(-1, 2)
+    drawn = np.concatenate([np.asarray(line.get_xydata())[::4] for line in ax.get_lines()])
+    for switch in sol.system.switches:
+        for guard, style in _guards(switch):
+            if depends(lambda t, y, g=guard: g(sol.system, t, y), (sol.t0, sol.y1), 0):
+                continue
+            h = jax.vmap(lambda point, g=guard: g(sol.system, sol.t0, unravel(point)))(plane)
+            h = np.asarray(h).reshape(GRID, GRID)
+            if h.min() < 0 < h.max():
+                _draw_surface(ax, switch, *along, h, style, drawn)
+    ax.set_xlim(xlim)
+    ax.set_ylim(ylim)
+
+
+def _guards(switch: AbstractSwitch) -> list[tuple[Any, str]]:
+    """Indicator functions with the line style of their surfaces: where a relay switches on, and off."""
+    if isinstance(switch, relay):
+        return [(switch.guard, "--"), (switch.off_guard, ":")]
+    return [(lambda *args: jnp.stack(switch.components(*args)).min(), "--")]
+
+
+def _draw_surface(
+    ax: "Axes", switch: AbstractSwitch, x: np.ndarray, y: np.ndarray, h: np.ndarray, style: str, drawn: np.ndarray
+) -> None:
+    line = dict(colors="0.35", linestyles=style, linewidths=1.0)
+    contour = ax.contour(x, y, h, levels=[0.0], zorder=1, **line)
+    name = switch.name if not isinstance(switch, relay) else f"{switch.name} {'on' if style == '--' else 'off'}"
+    ax.plot([], [], color="0.35", linestyle=style, linewidth=1.0, label=f"{name}: h = 0")
+    if isinstance(switch, sgn):
+        ax.contourf(x, y, h, levels=[h.min() - 1, 0.0], colors=["0.5"], alpha=0.12, zorder=0)
+    elif isinstance(switch, impact):
+        filled = ax.contourf(x, y, h, levels=[h.min() - 1, 0.0], colors=["none"], hatches=["////"], zorder=0)
+        filled.set_edgecolor("0.8")
+    if not isinstance(switch, relay):
+        vertices = np.concatenate([p.vertices for p in contour.get_paths()])
+        _draw_signs(ax, vertices, x, y, h, drawn)
+
+
+def _draw_signs(
+    ax: "Axes", vertices: np.ndarray, x: np.ndarray, y: np.ndarray, h: np.ndarray, drawn: np.ndarray
+) -> None:
+    """Writes + and - on either side of the surface, at its point that is farthest from what is drawn, and the frame."""
+    corner, size = np.array([x[0], y[0]]), np.array([x[-1] - x[0], y[-1] - y[0]])
+    place = (vertices - corner) / size  # in [0, 1] along both axes
+    room = np.array([np.abs(p - (drawn - corner) / size).max(axis=-1).min() for p in place])
+    room = np.minimum(room, np.minimum(place, 1 - place).min(axis=-1) + 0.02)
+    best = int(np.argmax(room))
+    column, row = np.round(place[best] * (GRID - 1)).astype(int)
+    slope = np.array([np.gradient(h, axis=1)[row, column], np.gradient(h, axis=0)[row, column]])
+    slope = slope / (np.linalg.norm(slope) or 1.0)
+    for text, side in (("+", 1), ("−", -1)):
+        ax.annotate(
+            text, vertices[best], 7 * side * slope, textcoords="offset points", ha="center", va="center", color="0.35", fontsize="small"
+        )
+
+
+def poincare_section(
+    points: Y,
+    x: str | None = None,
+    y: str | None = None,
+    *,
+    ax: "Axes | None" = None,
+    labels: Labels = None,
+    **style: Any,
+) -> "Axes":
+    """Draws the points at which trajectories pierce a section, as dots.
+
+    **Arguments:**
+
+    - `points`: states, leaves with one leading axis.
+    - `x`, `y`: names of components of the state; by default the first two.
+    - `ax`: where to draw; by default a new figure.
+    - `labels`: for the axes, as `{"x": "x [m]"}`.
+    - `style`: for the dots, as in `Axes.plot`.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` for an unknown component.
+    """
+    values = components(points, ndim=1)
+    x, y = chosen(values, [x, y])
+    ax = axes_or_new(ax)
+    style = dict(marker=".", markersize=2, linestyle="none") | style
+    ax.plot(values[x], values[y], **style)
+    ax.set_xlabel(axis_label(labels, x))
+    ax.set_ylabel(axis_label(labels, y))
+    return ax

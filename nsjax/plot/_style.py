@@ -1,0 +1,53 @@
+"""How modes and axes are shown, the same way in every picture."""
+
+from collections.abc import Mapping
+from typing import Any, TYPE_CHECKING
+
+from .._system import impact, relay, System
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Labels = Mapping[Any, str] | None
+
+EVENT = dict(marker="o", linestyle="none", markersize=4.5, markerfacecolor="white", markeredgecolor="black", zorder=4)
+JUMP = dict(color="0.4", linestyle=":", linewidth=1.0, zorder=1)
+
+
+def axes_or_new(ax: "Axes | None") -> "Axes":
+    if ax is not None:
+        return ax
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(layout="constrained")[1]
+
+
+def mode_line(system: System, mode: tuple[int, ...]) -> dict[str, Any]:
+    """Colour, width and label of a line in this mode: a colour of its own for each mode (of up to two switches), thick
+    while it slides."""
+    number, words, slides = 0, [], False
+    for k, (switch, value) in enumerate(zip(system.switches, mode)):
+        if isinstance(switch, impact):
+            words += [f"{switch.name}: rests"] * (value != 0)
+        elif isinstance(switch, relay):
+            words.append(f"{switch.name} {'on' if value else 'off'}")
+        else:
+            words.append(f"{switch.name} {('= 0, slides', '> 0', '< 0')[value]}")
+            slides |= value == 0
+            value = {-1: 0, 1: 1, 0: 2}[value]
+        number += 3**k * value
+    return dict(color=f"C{number % 10}", linewidth=3.5 if slides else 1.5, label="; ".join(words) or None)
+
+
+def axis_label(labels: Labels, name: Any, default: str | None = None) -> str:
+    return (labels or {}).get(name, name if default is None else default)
+
+
+def legend(ax: "Axes") -> None:
+    """A legend above the axes, where it hides nothing; each label once."""
+    handles, names = ax.get_legend_handles_labels()
+    unique = dict(zip(names, handles))
+    if unique:
+        place = dict(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize="small", frameon=False)
+        ax.legend(unique.values(), unique.keys(), **place)
