@@ -87,7 +87,9 @@ def _mode(args: argparse.Namespace, job: Job) -> dict[str, int] | None:
 
 def _start(job: Job) -> Any:
     if job.y0 is None:
-        raise UsageError("There is no default state; give one, as --y0 name=value,... or --y0 number,...")
+        raise UsageError(
+            f"There is no default state; give one: --y0 {','.join(f'{name}=..' for name in job.state) or '..,..'}"
+        )
     return job.y0
 
 
@@ -185,7 +187,7 @@ def main(argv: list[str] | None = None) -> int:
     args = _parser().parse_args(_joined(sys.argv[1:] if argv is None else argv))
     try:
         return {"list": lambda _: _list(), "run": _run, "orbit": _orbit}[args.command](args)
-    except UsageError as error:
+    except (UsageError, OSError) as error:
         message = str(error)
     except (TypeError, ValueError) as error:  # a mistake in the model or in an argument
         if not _is_ours(error):

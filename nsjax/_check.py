@@ -8,6 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from diffrax._root_finder import use_stepsize_tol
+
 from ._structure import is_affine, is_constant
 from ._system import impact, relay, sgn, System
 from ._types import Scalar, Y
@@ -28,7 +30,7 @@ def check_solve(
     saveat: Any,
     max_steps: Any,
     max_events: Any,
-) -> tuple[Y, Scalar, Scalar, dfx.AbstractStepSizeController, dict[str, Any]]:
+) -> tuple[Y, Scalar, Scalar, Any, dfx.AbstractStepSizeController, dict[str, Any]]:
     """Converts and checks the arguments of `solve`."""
     if not isinstance(system, System):
         hint = " Call it: `solve(Model(), ...)`." if isinstance(system, type) else ""
@@ -63,7 +65,24 @@ def check_solve(
     for name in ("solver_state", "controller_state", "made_jump"):
         if getattr(saveat, name):
             raise ValueError(f"Argument `saveat` must not ask for `{name}`, which a flow with events does not have.")
-    return y0, t0, t1, _controller(controller, dtype), _given(system, mode)
+    controller = _controller(controller, dtype)
+    return y0, t0, t1, _root_finder(solver, controller), controller, _given(system, mode)
+
+
+def _root_finder(solver: Any, controller: Any) -> Any:
+    """Gives an implicit solver's root finder the tolerances of the step size controller, as diffrax does."""
+    if not isinstance(solver, dfx.AbstractImplicitSolver):
+        return solver
+    open_ = [n for n in ("rtol", "atol", "norm") if getattr(solver.root_finder, n) is use_stepsize_tol]
+    if open_ and not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
+        raise ValueError(
+            "Argument `stepsize_controller` must be adaptive for an implicit solver whose root finder has no tolerances, "
+            "but got a fixed one. Use `diffrax.PIDController(rtol=..., atol=...)`, or pass "
+            "`root_finder=diffrax.VeryChord(rtol=..., atol=..., norm=optimistix.max_norm)` to the solver."
+        )
+    return eqx.tree_at(
+        lambda s: [getattr(s.root_finder, n) for n in open_], solver, [getattr(controller, n) for n in open_]
+    )
 
 
 def _controller(controller: Any, dtype: Any) -> dfx.AbstractStepSizeController:

@@ -35,7 +35,10 @@ def compact_cond(pred: Any, branch: Callable[..., Any], args: Any, default: Any)
 def _open(closed: jex.ClosedJaxpr) -> jex.Jaxpr:
     """The jaxpr with its constants as its first arguments."""
     jaxpr = closed.jaxpr
-    return jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars], debug_info=None) if jaxpr.constvars else jaxpr
+    names = (*[""] * len(jaxpr.constvars), *jaxpr.debug_info.arg_names)
+    return jaxpr.replace(
+        constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars], debug_info=jaxpr.debug_info._replace(arg_names=names)
+    )
 
 
 def _split(args: Any, jaxpr: jex.ClosedJaxpr) -> tuple[list, list]:

@@ -7,6 +7,7 @@ that each root is isolated or excluded.
 
 import functools as ft
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -46,15 +47,18 @@ def deflate(c: Float[Array, "... coefficients"], roots: Int[Array, "..."]) -> Fl
 
     def once(c: Array) -> Array:
         # τ B_{j-1}^{n-1} = (j/n) B_j^n, so q = c_j n/j of degree n-1; then elevated to degree n.
-        q = c[..., 1:] * (n / j[1:])
+        q = c[..., 1:] * jnp.asarray(n / j[1:], c.dtype)
         lower = jnp.concatenate([q[..., :1], q], axis=-1)
         upper = jnp.concatenate([q, q[..., -1:]], axis=-1)
-        return (j / n) * lower + (1 - j / n) * upper
+        up = jnp.asarray(j / n, c.dtype)
+        return up * lower + (1 - up) * upper
 
     first = once(c)
     roots = roots[..., None]
     # Dividing twice a polynomial of degree n = 1 leaves only the slope, which is what `once` of `once` gives.
-    return jnp.where(roots == 0, c, jnp.where(roots == 1, first, once(first)))
+    # A second root within rounding of the first cannot be told from a double one.
+    double = jnp.abs(first[..., :1]) <= 1e-10 * jnp.max(jnp.abs(first), axis=-1, keepdims=True)
+    return jnp.where(roots == 0, c, jnp.where((roots == 1) & ~double, first, once(first)))
 
 
 @ft.lru_cache
@@ -89,39 +93,51 @@ def _restrict(c: Float[Array, "parts coefficients"], a: Scalar, b: Scalar) -> Fl
     return left(head[..., ::-1], 1 - a / b)[..., ::-1]
 
 
-def evaluate(c: Float[Array, "... coefficients"], u: Scalar) -> Float[Array, "..."]:
-    """The polynomial at u."""
-    for _ in range(c.shape[-1] - 1):
-        c = c[..., :-1] + u * (c[..., 1:] - c[..., :-1])
-    return c[..., 0]
+def _value(c: list[Array], u: Scalar) -> Array:
+    """The polynomial with Bernstein coefficients `c` at u."""
+    while len(c) > 1:
+        c = [a + u * (b - a) for a, b in zip(c[:-1], c[1:])]
+    return c[0]
 
 
 def _polish(c: Float[Array, " coefficients"]) -> Scalar:
-    """The one root on [0, 1] of a polynomial with c[0] > 0 >= c[-1]: Newton's method kept inside the bracket."""
+    """The one root on [0, 1] of a polynomial with c[0] > 0 >= c[-1]: Newton's method kept inside the bracket.
+
+    The first steps are unrolled, being all that most roots need; for the others a loop goes on.
+    """
     n = c.shape[-1] - 1
-    slope = n * (c[1:] - c[:-1])
+    values = [c[j] for j in range(n + 1)]
+    slopes = [n * (b - a) for a, b in zip(values[:-1], values[1:])]
     eps = jnp.finfo(c.dtype).eps
 
-    def improve(state: tuple) -> tuple:
+    def improve(state: tuple, bisect: Any = np.False_) -> tuple:
         low, high, u, _, count = state
-        value = evaluate(c, u)
+        value = _value(values, u)
         low = jnp.where(value > 0, u, low)
         high = jnp.where(value > 0, high, u)
-        newton = u - value / evaluate(slope, u)
+        slope = _value(slopes, u)
+        newton = u - value / slope
         inside = (newton > low) & (newton < high)
-        # Every third step bisects unless Newton has all but halted: a flat polynomial cannot stall the search.
-        new = jnp.where(inside & ((count % 3 != 2) | (jnp.abs(newton - u) < 1e-3)), newton, 0.5 * (low + high))
-        new = jnp.where(value == 0, u, new)
-        done = (jnp.abs(new - u) <= 2 * eps * u) | (high - low <= eps * high)
+        new = jnp.where(inside & ~bisect, newton, 0.5 * (low + high))
+        exact = (value == 0) & (slope < 0)
+        new = jnp.where(exact, u, new)
+        done = exact | (jnp.abs(new - u) <= 4 * eps) | (high - low <= eps)
         return low, high, new, done, count + 1
 
     def busy(state: tuple) -> Bool[Array, ""]:
         *_, done, count = state
         return ~done & (count < 100)
 
-    guess = jnp.clip(c[0] / (c[0] - c[-1]), 0.0, 1.0)
-    start = (jnp.zeros_like(guess), jnp.ones_like(guess), guess, jnp.zeros((), bool), jnp.zeros((), jnp.int32))
-    return jax.lax.while_loop(busy, improve, start)[2]
+    def again(state: tuple) -> tuple:
+        # Every third step bisects: a flat polynomial cannot stall the search.
+        return improve(state, state[-1] % 3 == 2)
+
+    # A root at the very end is no place to start: an earlier one may be meant.
+    guess = jnp.where(c[-1] < 0, jnp.clip(c[0] / (c[0] - c[-1]), 0.0, 1.0), 0.5)
+    state = (jnp.zeros_like(guess), jnp.ones_like(guess), guess, jnp.zeros((), bool), jnp.zeros((), jnp.int32))
+    for _ in range(6):
+        state = improve(state)
+    return jax.lax.while_loop(busy, again, state)[2]
 
 
 def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], Scalar]:
@@ -138,31 +154,24 @@ def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], 
     """
     one = jnp.ones((), c.dtype)
 
-    def ends(level: Array, index: Array) -> tuple[Scalar, Scalar]:
-        width = one * 0.5**level
-        return index * width, (index + 1) * width
-
-    def look(level: Array, index: Array) -> tuple[Array, Bool[Array, ""], Bool[Array, ""], Int[Array, ""]]:
-        a, b = ends(level, index)
-        local = jnp.where(level == 0, c, _restrict(c, a, b))
+    def look(local: Array, level: Array) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+        """Whether an interval has no root, and whether it has one that need not be isolated further."""
         positive = local > 0
         variations = jnp.sum(positive[:, 1:] != positive[:, :-1], axis=-1)
         single = (variations == 1) & positive[:, 0]
-        silent = jnp.sum(~jnp.all(~positive, axis=-1)) == 1  # all other parts are negative throughout
-        begun = jnp.all(~positive[:, 0])
-        sure = begun | (jnp.any(single) & silent) | (level >= DEPTH)
-        return local, no_root(local), sure, jnp.argmax(single)
+        others_negative = jnp.sum(jnp.any(positive, axis=-1)) == 1
+        begun = ~jnp.any(positive[:, 0])
+        return no_root(local), begun | (jnp.any(single) & others_negative) | (level >= DEPTH)
 
     def busy(state: tuple) -> Bool[Array, ""]:
-        *_, done = state
-        return ~done
+        _, _, _, free, sure, over = state
+        return ~over & (free | ~sure)
 
     def walk(state: tuple) -> tuple:
-        level, index, _, _ = state
-        _, free, sure, _ = look(level, index)
-        # Past this interval: the next one at the coarsest level that starts there.
+        level, index, _, free, _, _ = state
+        # Past an interval without a root: the next one, at the coarsest level that starts there.
         after = index + 1
-        up = jnp.zeros((), jnp.int32)
+        up = jnp.zeros_like(level)
         moved = after
         for shift in (32, 16, 8, 4, 2, 1):
             even = (moved & ((1 << shift) - 1)) == 0
@@ -170,20 +179,22 @@ def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], 
             moved = jnp.where(even, moved >> shift, moved)
         up = jnp.minimum(up, level)
         over = free & ((after >> level) == 1)
-        next_level = jnp.where(free, level - up, level + 1)
-        next_index = jnp.where(free, after >> up, 2 * index)
-        done = sure & ~free | over
-        level = jnp.where(done, level, next_level)
-        index = jnp.where(done, index, next_index)
-        return level, index, sure & ~free, done
+        level, index = jnp.where(free, level - up, level + 1), jnp.where(free, after >> up, 2 * index)
+        a, width = index.astype(c.dtype), 0.5 ** level.astype(c.dtype)
+        local = jnp.where(level == 0, c, _restrict(c, a * width, (a + 1) * width))
+        return level, index, local, *look(local, level), over
 
     integer = jnp.int64 if jax.config.jax_enable_x64 else jnp.int32
-    start = (jnp.zeros((), integer), jnp.zeros((), integer), jnp.zeros((), bool), jnp.zeros((), bool))
-    level, index, found, _ = jax.lax.while_loop(busy, walk, start)
-    a, b = ends(level, index)
-    local, _, _, part = look(level, index)
-    begun = jnp.all(local[:, 0] <= 0)
-    polished = found & ~begun & (local[part, 0] > 0) & (local[part, -1] <= 0)
-    safe = jnp.where(polished, local[part], jnp.linspace(1.0, -1.0, c.shape[-1], dtype=c.dtype))
-    root = a + (b - a) * jnp.where(polished, _polish(safe), jnp.where(begun, 0.0, 0.5))
+    zero = jnp.zeros((), integer)
+    free, sure = look(c, zero)
+    level, index, local, free, _, over = jax.lax.while_loop(busy, walk, (zero, zero, c, free, sure, free))
+    found = ~over & ~free
+    positive = local > 0
+    begun = ~jnp.any(positive[:, 0])
+    part = jnp.argmax(positive[:, 0] & ~positive[:, -1])
+    chosen = local[part] if local.shape[0] > 1 else local[0]
+    polished = found & (chosen[0] > 0) & (chosen[-1] <= 0)
+    safe = jnp.where(polished, chosen, jnp.asarray(np.linspace(1, -1, c.shape[-1]), c.dtype))
+    place = jnp.where(polished, _polish(safe), jnp.where(begun, 0.0, 0.5))
+    root = (index.astype(c.dtype) + place) * 0.5 ** level.astype(c.dtype)
     return found, jnp.where(found, root, one)

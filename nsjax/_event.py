@@ -12,7 +12,7 @@ from ._crossing import first_root
 from ._filippov import Model, State
 from ._solution import RESULTS
 from ._step import stack, Stepper
-from ._system import impact, relay, sgn
+from ._system import frozen, impact, relay, sgn
 from ._types import Scalar, Y
 
 
@@ -91,7 +91,7 @@ def locate(
     root = jnp.where(found, root, jnp.inf)
     earliest = jnp.min(root)
     args = (model, t, y, f0, state)
-    frozen_model, start, y_start, f_start, _ = lax.stop_gradient(args)
+    frozen_model, start, y_start, f_start, _ = frozen(args)
     length = lax.stop_gradient(t_next) - start
     guess = start + jnp.minimum(earliest, 1) * length
 
@@ -181,7 +181,7 @@ def land(
         fired[k] = fired[k] | now
         if parts[k] is not None:
             tip[k] = tip[k] | (now & (state.mode[k] == 0)) if isinstance(model.switches[k], sgn) else tip[k]
-            parts[k] = jnp.where(now, jnp.where(state.mode[k] < 0, part, number), parts[k]).astype(jnp.int32)
+            parts[k] = jnp.where(now, jnp.where(state.mode[k] < 0, part.astype(jnp.int32), number), parts[k])
 
     result = RESULTS.successful
     after, at = before, {}
@@ -203,11 +203,14 @@ def land(
                 h0 = jnp.min(jnp.stack(model.h(k, te, before)))
                 h1 = jnp.min(jnp.stack(model.h(k, te, after)))
                 moved = h0 != h1
-                modes[k] = jnp.where(moved, jnp.sign(h1), modes[k]).astype(jnp.int32)
+                modes[k] = jnp.where(moved, jnp.sign(h1).astype(jnp.int32), modes[k])
                 roots[k] = jnp.where(moved, 0, roots[k])
                 here = (here & ~moved) | (moved & (h1 == 0))
             at[k] = here
     state_after = State(tuple(m.astype(jnp.int32) for m in modes), tuple(parts), tuple(roots))
+    # What cannot slide crosses when it fires, but for the residual of an event a few ulps earlier, which dh/dt tells.
+    crosses = {k: fired[k] & ~(halted & (state.roots[k] == 0)) for k in fired}
+    bounds = {k: b if k in model.slidable else crosses[k].astype(jnp.int32) for k, b in bounds.items()}
     state_after, _, wrong = model.settle(te, after, state_after, at, bounds)
     result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
 
@@ -221,7 +224,7 @@ def land(
             noise = model.rounding(
                 lambda t, y, first=first: (model.guards(t, y, state_after)[first][0],), te, after
             )[0]
-            roots[k] = jnp.where(fired[k], jnp.abs(guards[first][0]) <= noise, roots[k]).astype(jnp.int32)
+            roots[k] = jnp.where(fired[k], (jnp.abs(guards[first][0]) <= noise).astype(jnp.int32), roots[k])
         elif isinstance(switch, impact):
             t_after, after, roots[k], failed = _rebounded(
                 model, k, fired[k], t_start, te, before, state, t_after, after, state_after, roots[k]

@@ -201,7 +201,7 @@ class Model(eqx.Module):
             elif isinstance(switch, impact):
                 row = [self.h(k, t, y)[slot.part]]
             elif self.parts[k] == 1:
-                row = [jnp.where(mode == 0, one, mode * self.h(k, t, y)[0])]
+                row = [jnp.where(mode == 0, one, mode.astype(t.dtype) * self.h(k, t, y)[0])]
             else:
                 row = self._corner_guard(slot, t, y, state)
             rows.append(row)
@@ -301,6 +301,8 @@ class Model(eqx.Module):
             else:
                 unmoved = jnp.where(came[k] == 0, 1, came[k])
                 side = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
+                # It cannot but cross; at a double root the sign of dh/dt is rounding.
+                side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
                 trial[k] = jnp.where(at[k], side, mode[k])
         for _ in range(2 * len(sgns) + 1 if len(sgns) > 1 else 1):
             trial, wrong = self._amend(sgns, at, leaves, trial, look(trial))
@@ -314,7 +316,7 @@ class Model(eqx.Module):
         unsure = false
         for k in sgns:
             # Leaving with dh/dt = 0 (the end of sliding with b = 1) makes a double root of h at this instant.
-            simple = rates[k] * trial[k] > 1e-10 * jnp.abs(slopes[k])
+            simple = rates[k] * trial[k].astype(t.dtype) > 1e-10 * jnp.abs(slopes[k])
             fresh = jnp.where(trial[k] == 0, 0, jnp.where(simple, 1, 2))
             roots[k] = jnp.where(at[k], fresh, roots[k]).astype(jnp.int32)
             unsure = unsure | (at[k] & (trial[k] == 0) & (slopes[k] > 0) & (came[k] == 0))
@@ -329,9 +331,8 @@ class Model(eqx.Module):
             loose = at[k] & (trial[k] == 0) if k in self.slidable else jnp.zeros((), bool)
             excess.append(jnp.where(loose, jnp.abs(s[k]) / (self.bound(k) if k in self.slidable else 1) - 1, -1))
             free = at[k] & (trial[k] != 0)
-            if k in self.slidable:
-                free = free & (leaves[k] == 0)  # its λ is at the bound: dh/dt is zero but for rounding
-            against = -rates[k] * trial[k]
+            free = free & (leaves[k] == 0)  # its λ is at the bound (or it crosses): dh/dt may be zero but for rounding
+            against = -rates[k] * trial[k].astype(rates[k].dtype)
             small = 1e-10 * jnp.abs(slopes[k])
             opposed.append(jnp.where(free & (against > small), against, 0))
         worst = jnp.stack(excess)

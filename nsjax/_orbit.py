@@ -18,7 +18,7 @@ from ._jacobian import dense_jacobian
 from ._saltation import _states
 from ._solution import Events, RESULTS, Solution
 from ._solve import solve
-from ._system import arrays_of, relay, sgn, System
+from ._system import arrays_of, frozen, relay, sgn, System
 from ._types import Scalar, Y
 from ._variational import arcs, monodromy_by_arcs
 
@@ -102,7 +102,7 @@ def _shoot(
 ) -> Orbit:
     """Newton's method on y(t0 + period) = y0, and everything said of the orbit."""
     autonomous = system.period is None
-    still = lax.stop_gradient(system)
+    still = frozen(system)
     model = Model(still, jnp.ones_like(t0), t0, y0)
     guess = lax.stop_gradient(y0)
     if autonomous and model.slots:
@@ -288,7 +288,7 @@ def find_orbit(
     """
     if not isinstance(order, int) or order < 1:
         raise ValueError(f"Argument `order` must be a positive integer, but got {order!r}.")
-    y0, t0, _, controller, given = check_solve(
+    y0, t0, _, solver, controller, given = check_solve(
         system, t0, t0, y0, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events
     )
     double = bool(jnp.finfo(t0.dtype).eps < 1e-10)
@@ -307,7 +307,7 @@ def find_orbit(
     kwargs = dict(order=order, mode=given, method=method, tol=tol, max_iterations=max_iterations)
     settled = autonomous and period is None
     if settled:
-        y0, period = _settle(lax.stop_gradient(system), t0, lax.stop_gradient(y0), given, method)
+        y0, period = _settle(frozen(system), t0, lax.stop_gradient(y0), given, method)
         kwargs["mode"] = None
     period = jnp.asarray(1.0 if period is None else period, t0.dtype)
     if concrete and autonomous and not period > 0:

@@ -136,7 +136,7 @@ class Saved(eqx.Module):
             length = t1 - t0
             u = jnp.where(length > 0, (t - t0) / jnp.where(length > 0, length, 1), 1)
             saved = saved.write(now, t, bernstein(points, u), mode, system, direction)
-            return eqx.tree_at(lambda s: s.next, saved, saved.next + now)
+            return eqx.tree_at(lambda s: s.next, saved, saved.next + now.astype(jnp.int32))
 
         dynamic, static = eqx.partition(self, eqx.is_array)
         dynamic = lax.while_loop(

@@ -77,11 +77,11 @@ def _start(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[State,
         elif switch.name in given:
             mode = jnp.asarray(given[switch.name], jnp.int32)
             # A state taken from an earlier solution may carry some drift off its surface.
-            off = jnp.where(mode == 0, jnp.abs(h) > 1e6 * noise, mode * h < -1e6 * noise)
+            off = jnp.where(mode == 0, jnp.abs(h) > 1e6 * noise, mode.astype(h.dtype) * h < -1e6 * noise)
             result = RESULTS.where(off, RESULTS.wrong_mode, result)
             modes.append(mode)
             at[k] = jnp.zeros((), bool)
-            on[k] = mode * h <= noise
+            on[k] = mode.astype(h.dtype) * h <= noise
         else:
             modes.append(jnp.where(on[k], 0, jnp.sign(h)).astype(jnp.int32))
             at[k] = on[k]
@@ -163,7 +163,7 @@ class _Flow(eqx.Module):
                 for values in zip(*[row[i] for row in rows]):
                     v = jnp.stack(values)
                     tail = jnp.max(jnp.abs(jnp.asarray(to_chebyshev(n)[-2:], t.dtype) @ v))
-                    resolved = resolved & ~(tail > 1e-7 * jnp.max(jnp.abs(v)))
+                    resolved = resolved & ~(tail > max(1e-7, 64 * float(jnp.finfo(t.dtype).eps)) * jnp.max(jnp.abs(v)))
                     out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ v))
         return out, resolved
 
@@ -208,11 +208,15 @@ class _Flow(eqx.Module):
             result = RESULTS.where(keep & ~finite, RESULTS.nonfinite_field, result)
             # A guard that is no polynomial to the precision needed is not trusted: a shorter step is. (At most so
             # often: one with a kink never is.)
-            poor = keep & finite & ~resolved & (halvings < 30)
+            # Nor is a step so short that rounding of time alone spoils the polynomial.
+            eps = float(jnp.finfo(c.t.dtype).eps)
+            floor = 4 * eps / max(1e-7, 64 * eps) * jnp.maximum(jnp.abs(c.t), self.t1 - self.t0)
+            poor = keep & finite & ~resolved & (halvings < 30) & (t_next - c.t > floor)
             halvings = jnp.where(poor, halvings + 1, jnp.where(keep, 0, halvings))
             keep = keep & ~poor
             dt = jnp.where(poor, 0.5 * (t_next - c.t), dt)
-            busy = c.active & keep & finite & ~quiet
+            # On the last few ulps before the end the polynomials are rounding.
+            busy = c.active & keep & finite & ~quiet & (t_next - c.t > 4 * eps * jnp.abs(c.t))
         keep = keep & c.active
 
         y_end = model.project(t_next, y1, c.state)
@@ -246,7 +250,7 @@ class _Flow(eqx.Module):
             log = log.write(
                 events, log_it, there.t * model.direction, there.y_before, there.y_after, there.slot, there.state.mode
             )
-            events = events + log_it
+            events = events + log_it.astype(jnp.int32)
             halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(keep, 0, halted))
             result = RESULTS.where(event, there.result, result)
             result = RESULTS.where(halted > 8 + 4 * len(model.switches), RESULTS.stuck_in_events, result)
@@ -261,14 +265,14 @@ class _Flow(eqx.Module):
         if saved.request.ts is not None:
             saved = saved.write_times(moved, c.t, t_stop, points, c.state.mode, model.system, model.direction)
         saved = saved.write_step(moved, c.accepted, c.t, t_stop, points)
-        accepted = c.accepted + moved
+        accepted = c.accepted + moved.astype(jnp.int32)
         if self.keep_steps:
             due = moved & ((accepted % self.keep_steps == 0) | event)
             saved = saved.write(due, t_stop, before, c.state.mode, model.system, model.direction)
             saved = saved.write(due & event, t, y, state.mode, model.system, model.direction)
         t, y, f, state = settle((t, y, f, state), (c.t, c.y, c.f, c.state))
 
-        steps = c.steps + c.active
+        steps = c.steps + c.active.astype(jnp.int32)
         done = t >= self.t1
         result = RESULTS.where((steps >= self.max_steps) & ~done & (result == RESULTS.successful), RESULTS.max_steps_reached, result)
         if model.slots:
@@ -515,7 +519,7 @@ def solve(
     **Raises:** `TypeError`, `ValueError` for mistakes in the model or the arguments; a runtime error that tells which of
     `RESULTS` occurred, if `throw`.
     """
-    y0, t0, t1, controller, given = check_solve(
+    y0, t0, t1, solver, controller, given = check_solve(
         system, t0, t1, y0, mode, solver, stepsize_controller, saveat, max_steps, max_events
     )
     system = arrays_of(system, t0.dtype)

@@ -228,3 +228,8 @@ def arrays_of(system: System, dtype: Any) -> System:
         if is_float_field(field) and isinstance(value, int) and not isinstance(value, bool):
             system = eqx.tree_at(lambda m, n=field.name: getattr(m, n), system, float(value), is_leaf=lambda x: x is None)
     return jax.tree.map(convert, system)
+
+
+def frozen(tree: Any) -> Any:
+    """The same with no derivative; `lax.stop_gradient` alone would turn static integers into tracers."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)

@@ -51,7 +51,7 @@ def fundamental_matrix(
     """
     if method not in ("variational", "autodiff"):
         raise ValueError(f"Argument `method` must be 'variational' or 'autodiff', but got {method!r}.")
-    y0, t0, t1, controller, _ = check_solve(
+    y0, t0, t1, solver, controller, _ = check_solve(
         system, t0, t1, y0, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events
     )
     if stepsize_controller is None:

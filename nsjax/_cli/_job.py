@@ -29,6 +29,7 @@ class Job:
     title: str
     system: System
     y0: Y | None
+    state: tuple[str, ...]  # names of its leaves, where they are known
     t0: float
     t1: float | None
     guess: gallery.OrbitGuess | None
@@ -95,7 +96,7 @@ def load(name: str, parameters: Mapping[str, str], y0: str | None) -> Job:
         ) from None
     system = _make(entry.system, dataclasses.fields(entry.system()), parameters)
     start = entry.y0 if y0 is None else _state(y0, type(entry.y0), entry.y0._asdict())
-    return Job(entry.key, entry.title, system, _arrays(start), entry.t0, entry.t1, entry.orbit, True)
+    return Job(entry.key, entry.title, system, _arrays(start), entry.y0._fields, entry.t0, entry.t1, entry.orbit, True)
 
 
 def _load_file(name: str, parameters: Mapping[str, str], y0: str | None) -> Job:
@@ -105,7 +106,7 @@ def _load_file(name: str, parameters: Mapping[str, str], y0: str | None) -> Job:
     module = _module(pathlib.Path(path))
     names = [key for key, value in vars(module).items() if _is_model(value, module)]
     if attribute not in names:
-        raise _unknown(f"system in {path}", attribute, names)
+        raise _unknown(f"system in {path}:", attribute, names)
     found = getattr(module, attribute)
     if isinstance(found, System):
         system = _make(lambda **changes: dataclasses.replace(found, **changes), dataclasses.fields(found), parameters)
@@ -117,7 +118,7 @@ def _load_file(name: str, parameters: Mapping[str, str], y0: str | None) -> Job:
     else:
         start = _arrays(cls(**cls._field_defaults)) if cls and set(cls._fields) == set(cls._field_defaults) else None
     title = (type(system).__doc__ or "").strip().partition("\n")[0]
-    return Job(name, title, system, start, 0.0, None, None, False)
+    return Job(name, title, system, start, cls._fields if cls else (), 0.0, None, None, False)
 
 
 def _module(path: pathlib.Path) -> ModuleType:

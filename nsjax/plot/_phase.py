@@ -137,7 +137,14 @@ def _draw_signs(
     slope = slope / (np.linalg.norm(slope) or 1.0)
     for text, side in (("+", 1), ("−", -1)):
         ax.annotate(
-            text, vertices[best], 7 * side * slope, textcoords="offset points", ha="center", va="center", color="0.35", fontsize="small"
+            text,
+            vertices[best],
+            7 * side * slope,
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            color="0.35",
+            fontsize="small",
         )
 
 

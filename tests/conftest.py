@@ -1,0 +1,15 @@
+"""How the tests run: double precision, strict promotion of dtypes, compiled programs kept between runs."""
+
+import os
+import pathlib
+
+import jax
+import matplotlib
+
+
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(__file__).parents[1] / ".jax_cache"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "standard")
+matplotlib.use("Agg")

@@ -1,0 +1,241 @@
+"""Small models with known solutions, and a few shorthands, for the tests of the flow.
+
+Tests share them because every new class of system is one more program to compile.
+"""
+
+from typing import NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+import nsjax
+from nsjax import gallery
+
+
+Motion = type(gallery.THESIS["3.4"].y0)  # (x, v)
+
+
+def pid(tol: float) -> dfx.PIDController:
+    return dfx.PIDController(rtol=tol, atol=tol)
+
+
+def flat(y) -> np.ndarray:
+    """The state (or a batch of states, along the first axis) as a vector."""
+    return np.stack([np.asarray(x) for x in jax.tree.leaves(y)], -1)
+
+
+def times(sol) -> np.ndarray:
+    """Event times."""
+    return np.asarray(sol.events.t)[: int(sol.events.num)]
+
+
+def itinerary(sol) -> list[tuple[str, int, int]]:
+    """(switch, its mode before, its mode after) of every event."""
+    return [(e.switch, e.mode_before[e.switch], e.mode_after[e.switch]) for e in sol.events]
+
+
+class Point(NamedTuple):
+    x: Array
+
+
+class Plane(NamedTuple):
+    x: Array
+    y: Array
+
+
+class Heat(NamedTuple):
+    T: Array
+
+
+class Thermostat(nsjax.System):
+    """T' = a (T_env + 30 heater - T), on below T_low, off above T_high. With `T_high = T_low` it chatters."""
+
+    a: float = 1.0
+    T_env: float = 5.0
+    T_low: float = 18.0
+    T_high: float = 22.0
+
+    def vector_field(self, t, y, s):
+        return Heat(self.a * (self.T_env + 30.0 * s.heater - y.T))
+
+    @nsjax.relay
+    def heater(self, t, y):
+        return self.T_low - y.T
+
+    @heater.off
+    def heater(self, t, y):
+        return y.T - self.T_high
+
+
+class Hammer(nsjax.System):
+    """m x'' + c x' + k x = b + f_0 cos ωt + contact, wall at x >= x_w, restitution e: `reference.ImpactOscillator`."""
+
+    m: float = 1.0
+    c: float = 0.02
+    k: float = 1.0
+    b: float = 0.0
+    f_0: float = 1.0
+    omega: float = 0.8
+    x_w: float = 0.5
+    e: float = 0.8
+
+    def vector_field(self, t, y, s):
+        force = self.b + self.f_0 * jnp.cos(self.omega * t) - self.c * y.v - self.k * y.x
+        return Motion(y.v, (force + s.wall) / self.m)
+
+    @nsjax.impact
+    def wall(self, t, y):
+        return y.x - self.x_w
+
+    @wall.restitution
+    def wall(self):
+        return self.e
+
+
+class Pair(nsjax.System):
+    """(x, y)' = (w t, g) - [[2, c], [c, 2]] (sgn x, sgn y): two surfaces, coupled by c; piecewise polynomial in t."""
+
+    w: float = 0.1
+    g: float = 0.5
+    c: float = 0.5
+
+    def vector_field(self, t, y, s):
+        return Plane(self.w * t - 2 * s.a - self.c * s.b, self.g - self.c * s.a - 2 * s.b)
+
+    @nsjax.sgn
+    def a(self, t, y):
+        return y.x
+
+    @nsjax.sgn
+    def b(self, t, y):
+        return y.y
+
+
+class Circle(nsjax.System):
+    """r' = r (g sin t - s), θ' = w: slides on the unit circle while |g sin t| < 1; a surface that is not affine."""
+
+    w: float = 1.0
+    g: float = 0.5
+
+    def vector_field(self, t, y, s):
+        radial = self.g * jnp.sin(t) - s.circle
+        return Plane(radial * y.x - self.w * y.y, radial * y.y + self.w * y.x)
+
+    @nsjax.sgn
+    def circle(self, t, y):
+        return y.x**2 + y.y**2 - 1
+
+
+class Belt(nsjax.System):
+    """`gallery.StickSlip` with m = k = 1, c = 0 and the indicator function multiplied by `scale`."""
+
+    v_dr: float = 0.2
+    F_slip: float = 1.0
+    F_stick: float = 2.0
+    scale: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - self.F_slip * s.belt)
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return self.scale * (y.v - self.v_dr)
+
+    @belt.breakaway
+    def belt(self):
+        return self.F_stick / self.F_slip
+
+
+class Signs(NamedTuple):
+    z: Array  # integrals of the three switch values
+    q: Array  # the third guard, as a state
+
+
+class Roots(nsjax.System):
+    """Three switches whose guards are quartics in t with prescribed roots: two of them explicit functions of time,
+    the third a state. Its solution records on which side each of them was, and for how long."""
+
+    roots: Array  # (3, 4)
+    scale: Array  # (3,)
+
+    def quartic(self, k, t):
+        return self.scale[k] * jnp.prod(t - self.roots[k])
+
+    def start(self):
+        return Signs(jnp.zeros(3), self.quartic(2, 0.0))
+
+    def vector_field(self, t, y, s):
+        rate = jax.jvp(lambda t: self.quartic(2, t), (t,), (jnp.ones_like(t),))[1]
+        return Signs(jnp.stack([s.a, s.b, s.c]), rate)
+
+    @nsjax.sgn
+    def a(self, t, y):
+        return self.quartic(0, t)
+
+    @nsjax.sgn
+    def b(self, t, y):
+        return self.quartic(1, t)
+
+    @nsjax.sgn
+    def c(self, t, y):
+        return y.q
+
+
+class Puck(NamedTuple):
+    x: Array
+    v: Array
+    u: Array
+
+
+class Bumper(nsjax.System):
+    """A puck that bounces between walls x >= -1 and x <= 1, with dry friction on v (its sign flips at every impact,
+    pitfall 35), a relay on v that every impact may switch, and a clock that changes the friction at t = t_c."""
+
+    order: tuple[int, ...] = (0, 1, 2, 3, 4)
+    e: float = 0.9
+    mu: float = 0.1
+    t_c: float = 2.0
+
+    @property
+    def switches(self):
+        found = super().switches
+        return tuple(found[i] for i in self.order)
+
+    def vector_field(self, t, y, s):
+        friction = self.mu * (1.5 + 0.5 * s.clock) * s.rub
+        return Puck(y.v, -friction + s.left - s.right, s.motor)
+
+    @nsjax.impact
+    def left(self, t, y):
+        return y.x + 1
+
+    @left.restitution
+    def left(self):
+        return self.e
+
+    @nsjax.impact
+    def right(self, t, y):
+        return 1 - y.x
+
+    @right.restitution
+    def right(self):
+        return self.e
+
+    @nsjax.sgn
+    def rub(self, t, y):
+        return y.v
+
+    @nsjax.relay
+    def motor(self, t, y):  # on when moving right fast enough, off when moving left fast enough
+        return y.v - 0.5
+
+    @motor.off
+    def motor(self, t, y):
+        return -0.5 - y.v
+
+    @nsjax.sgn
+    def clock(self, t, y):
+        return t - self.t_c

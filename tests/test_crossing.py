@@ -1,0 +1,150 @@
+"""Roots of guards: none missed, none out of order."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import Roots
+
+import nsjax
+from nsjax._crossing import deflate, elevate, evaluate, first_root, no_root, nodes, to_bernstein, to_chebyshev
+
+
+def bernstein(power: np.ndarray) -> np.ndarray:
+    """Bernstein coefficients on [0, 1] of Σ power[..., i] τ^i."""
+    n = power.shape[-1] - 1
+    m = np.array([[math.comb(j, i) / math.comb(n, i) if i <= j else 0.0 for i in range(n + 1)] for j in range(n + 1)])
+    return power @ m.T
+
+
+def from_roots(roots: np.ndarray) -> np.ndarray:
+    return np.array([np.polynomial.polynomial.polyfromroots(r) for r in roots])
+
+
+search = jax.jit(jax.vmap(first_root))
+
+
+@pytest.mark.parametrize("n", [1, 4, 8])
+def test_polynomial_bases(n):
+    rng = np.random.default_rng(n)
+    power = rng.normal(size=n + 1)
+    c, u = bernstein(power), rng.uniform(size=7)
+    exact = np.polynomial.polynomial.polyval(u, power)
+    values = np.polynomial.polynomial.polyval(nodes(n), power)
+    np.testing.assert_allclose(to_bernstein(n) @ values, c, atol=1e-11)
+    np.testing.assert_allclose([evaluate(jnp.asarray(c), x) for x in u], exact, atol=1e-13)
+    np.testing.assert_allclose([evaluate(elevate(n, n + 3) @ c, x) for x in u], exact, atol=1e-13)
+    chebyshev = np.polynomial.chebyshev.chebval(2 * u - 1, to_chebyshev(n) @ values)
+    np.testing.assert_allclose(chebyshev, exact, atol=1e-13)
+    for k in (1, 2)[:n]:
+        lifted = bernstein(np.concatenate([np.zeros(k), power[: n + 1 - k]]))  # τ^k p, of degree n
+        low = np.polynomial.polynomial.polyval(u, power[: n + 1 - k])
+        got = [evaluate(deflate(jnp.asarray(lifted), jnp.asarray(k)), x) for x in u]
+        np.testing.assert_allclose(got, low, atol=1e-12)
+
+
+def test_first_root_of_random_polynomials():
+    """Pitfall 5: against the roots they were made from; close pairs, multiple roots, roots at the ends, none."""
+    rng = np.random.default_rng(0)
+    count, degree = 3000, 6
+    roots = rng.uniform(-0.3, 1.3, (count, degree))
+    kind = np.arange(count) % 6
+    roots[kind == 1, 1] = roots[kind == 1, 0] + 10.0 ** rng.uniform(-6, -2, count)[kind == 1]
+    roots[kind == 2, 1] = roots[kind == 2, 0]
+    roots[kind == 3] = rng.uniform(1.01, 2, (count, degree))[kind == 3]
+    roots[kind == 4, 0] = 1.0
+    roots[kind == 5, :3] = roots[kind == 5, :1]
+    power = from_roots(roots)
+    power *= np.sign(power[:, :1]) * 10.0 ** rng.uniform(-12, 12, (count, 1))  # positive at the start; pitfall 27
+    found, tau = map(np.asarray, search(jnp.asarray(bernstein(power))[:, None]))
+    inside = np.where((roots >= 0) & (roots <= 1), roots, np.inf)
+    first = inside.min(1)
+    # What rounding of the coefficients (1e-16 of the largest) may do to a root, by its multiplicity.
+    scale = abs(power).max(1)
+    for i in range(count):
+        others = np.abs(np.delete(roots[i], np.argmin(abs(roots[i] - first[i]))) - first[i])
+        if np.isinf(first[i]):
+            assert not found[i]
+            continue
+        order = 1 + np.sum(others < 1e-5)
+        lead = abs(power[i, -1]) * np.prod(others[others >= 1e-5])
+        slack = 10 * (1e-14 * scale[i] / lead) ** (1 / order) + 1e-14
+        edge = first[i] > 1 - slack or order % 2 == 0  # rounding may take these roots away
+        assert found[i] or edge, (i, roots[i])
+        if found[i] and not (edge and abs(tau[i] - first[i]) > slack):
+            assert abs(tau[i] - first[i]) <= slack, (i, tau[i], first[i], roots[i])
+        elif found[i]:  # a double root that vanished: then it is the next one
+            assert np.min(abs(roots[i] - tau[i])) <= 1e-6
+
+
+@pytest.mark.parametrize("end", [0.0, 1e-17, -1e-17])
+def test_root_at_the_end_does_not_hide_an_earlier_one(end):
+    """Pitfall 9: the guard vanishes at the end of the step, and before."""
+    c = jnp.asarray([1.0, 0.1, -0.5, end])[None, None]
+    exact = np.roots([np.polynomial.polynomial.Polynomial(p).coef for p in [[1, -2.7, 0.9, 0.8]]][0][::-1])
+    assert exact.real.min() is not None
+    found, tau = search(c)
+    assert found[0] and abs(evaluate(c[0, 0], tau[0])) < 1e-15 and tau[0] < 0.5
+
+
+def test_maximum_of_two_parts():
+    """A slot is the maximum over its parts: it fires when the last of them has become non-positive."""
+    a, b = bernstein(from_roots(np.array([[0.3, 1.2], [0.6, 0.7]])))
+    first, *_ = search(jnp.asarray([[a, -np.ones(3)], [a, b], [a, 1e-3 + 0 * b]]))
+    assert list(first) == [True, True, False]
+    found, tau = search(jnp.asarray([[a, -np.ones(3)], [a, b], [-a, b], [a, -a]]))
+    assert list(found) == [True, True, False, True]  # -a is positive from 0.3 on, so that one part always is
+    np.testing.assert_allclose(tau[np.array([0, 1, 3])], [0.3, 0.6, 0.3], atol=1e-14)
+    assert not no_root(jnp.asarray([a, b])) and no_root(jnp.asarray([a, np.ones(3)]))
+
+
+# The property test of the flow: prescribed roots, found by `solve`.
+
+KINDS = ("generic", "close pair", "double", "simultaneous", "at t0", "at t1", "cluster")
+
+
+def make(count: int, seed: int = 0):
+    rng = np.random.default_rng(seed)
+    r = rng.uniform(-0.1, 1.1, (count, 3, 4))
+    kind = rng.integers(0, len(KINDS), (count, 3))
+    gap = 10.0 ** rng.uniform(-6, -2, (count, 3))
+    for k in range(3):
+        r[:, k, 1] = np.where(kind[:, k] == 1, r[:, k, 0] + gap[:, k], r[:, k, 1])
+        r[:, k, 1] = np.where(kind[:, k] == 2, r[:, k, 0], r[:, k, 1])
+        r[:, k, 1] = np.where((kind[:, k] == 3) & (k > 0), r[:, k - 1, 0], r[:, k, 1])
+        r[:, k, 0] = np.where(kind[:, k] == 4, 0.0, np.where(kind[:, k] == 5, 1.0, r[:, k, 0]))
+        for j in (2, 3):
+            r[:, k, j] = np.where(kind[:, k] == 6, r[:, k, 1] + 1e-3 * (j - 1), r[:, k, j])
+    return r, rng.choice([-1, 1], (count, 3)) * 10.0 ** rng.uniform(-1, 1, (count, 3)), kind
+
+
+@jax.jit
+@jax.vmap
+def run(roots, scale):
+    system = Roots(roots, scale)
+    return nsjax.solve(system, 0.0, 1.0, system.start(), max_events=32, throw=False)
+
+
+@pytest.mark.parametrize("count", [500, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_no_root_missed_and_none_out_of_order(count):
+    """Pitfalls 2, 5, 6, 7, 9, 10: quartic guards with prescribed roots, generic, close (1e-6 to 1e-2), double,
+    clustered, common to two switches, at t0, at t1. The solution knows for how long each guard was positive."""
+    r, scale, kind = make(count)
+    sol = jax.tree.map(np.asarray, run(r, scale))
+    assert np.all(sol.result == nsjax.RESULTS.successful), np.flatnonzero(sol.result != nsjax.RESULTS.successful)
+    t = np.where(np.isfinite(sol.events.t), sol.events.t, 2.0)
+    assert np.all(np.diff(t, axis=1) >= 0)
+    inside = np.sort(np.clip(r, 0, 1), axis=-1)
+    ends = np.concatenate([np.zeros((count, 3, 1)), inside, np.ones((count, 3, 1))], -1)
+    middle = 0.5 * (ends[..., 1:] + ends[..., :-1])
+    sign = np.sign(scale)[..., None] * np.prod(np.sign(middle[..., None] - r[:, :, None, :]), -1)
+    truth = np.sum(np.diff(ends) * sign, -1)
+    np.testing.assert_allclose(sol.y1.z, truth, atol=1e-5)  # double roots: 1e-8 square-rooted
+    for i, k in np.ndindex(count, 3):
+        for root in r[i, k][(r[i, k] > 0) & (r[i, k] < 1)]:
+            others = np.sort(abs(r[i, k] - root))[1:]
+            if others[0] > 0:  # a simple root
+                slack = 1e-13 + 1e-14 / np.prod(others)
+                assert np.min(abs(t[i][sol.events.switch[i] == k] - root), initial=2) < slack, (i, KINDS[kind[i, k]])

@@ -1,0 +1,301 @@
+"""Trajectories against closed forms and 40-digit references."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from models import (
+    Belt,
+    Bumper,
+    Circle,
+    flat,
+    Hammer,
+    Heat,
+    itinerary,
+    Motion,
+    Pair,
+    pid,
+    Plane,
+    Puck,
+    Thermostat,
+    times,
+)
+
+from nsjax import gallery, RESULTS, solve
+
+
+def compare(sol, ref, names, *, time, state):
+    """Events (kind, time, state) and final state against a reference solution."""
+    assert [names[e.mode_after[e.switch]] for e in sol.events] == [e[1] for e in ref.events]
+    np.testing.assert_allclose(times(sol), [e[0] for e in ref.events], atol=time, rtol=0)
+    np.testing.assert_allclose(
+        flat(sol.events.y_after)[: len(ref.events)], np.array([e[2:] for e in ref.events]).reshape(-1, 2), atol=state
+    )
+    np.testing.assert_allclose(flat(sol.y1), ref.y, atol=state)
+
+
+STICK = {0: "stick", -1: "slip", 1: "slip"}
+
+
+@pytest.mark.parametrize(
+    "y0, parameters",
+    [
+        ((2.5, -0.5), dict()),
+        ((2.5, -0.5), dict(v_dr=0.7, k=1.3)),
+        ((0.3, 1.5), dict(c=0.1, v_dr=0.3, F_stick=1.5)),
+        ((1.0, 0.0), dict(v_dr=-0.4, m=2.0, F_slip=0.7)),
+    ],
+)
+def test_stick_slip(y0, parameters):
+    """Section 3.4, static friction point: slip, stick, breakaway at F_stick; pitfalls 1, 13, 14."""
+    ref = reference.solution(reference.StickSlip, 60.0, y0, **parameters)
+    sol = solve(gallery.StickSlip(**parameters), 0.0, 60.0, Motion(*y0), stepsize_controller=pid(1e-10), max_steps=8192)
+    names = STICK if all(e[1] != "cross" for e in ref.events) else None
+    if names is None:  # a crossing leaves the other sign, as a slip does
+        names = {0: "stick", -1: "slip", 1: "slip"}
+        ref = ref._replace(events=[(t, "slip" if k == "cross" else k, x, v) for t, k, x, v in ref.events])
+    compare(sol, ref, names, time=3e-9, state=3e-9)
+    sticks = flat(sol.events.y_after)[: len(sol.events)]
+    np.testing.assert_allclose(sticks[:, 1], parameters.get("v_dr", 0.2), atol=1e-13)
+
+
+def test_stick_slip_from_every_kind_of_start():
+    """Pitfall 2: starts on the surface, which stick, slip either way, or lie at the very end of stick."""
+    # At (2, 0.2), the end of stick, it sticks for zero time; the reference starts an ulp later.
+    cases = {(0.5, 0.2): 0, (-1.9, 0.2): 0, (2.5, 0.2): -1, (-2.5, 0.2): 1, (2.5, 0.3): 1, (2.0, 0.2): None}
+    y0 = Motion(*jnp.asarray(list(cases)).T)
+
+    def run(y0):
+        return solve(
+            gallery.StickSlip(), 0.0, 20.0, y0, saveat=dfx.SaveAt(t0=True, t1=True), stepsize_controller=pid(1e-10)
+        )
+
+    sol = jax.jit(jax.vmap(run))(y0)
+    for i, (start, mode) in enumerate(cases.items()):
+        assert mode in (None, int(sol.modes[i, 0, 0])), start
+        ref = reference.solution(reference.StickSlip, 20.0, start if mode is not None else (2 + 1e-15, 0.2))
+        assert mode is None or sol.events.num[i] == len(ref.events)
+        np.testing.assert_allclose([sol.y1.x[i], sol.y1.v[i]], ref.y, atol=1e-8)
+
+
+def test_scale_of_the_indicator_function_does_not_matter():
+    """Pitfall 27: h multiplied by 1e-12 ... 1e12."""
+    scale = 10.0 ** jnp.asarray([0.0, -12.0, -6.0, 6.0, 12.0])
+    sol = jax.jit(jax.vmap(lambda s: solve(Belt(scale=s), 0.0, 30.0, Motion(2.5, -0.5), throw=False)))(scale)
+    assert np.all(sol.result == RESULTS.successful)
+    assert np.all(sol.events.num == sol.events.num[0]) and sol.events.num[0] > 3
+    np.testing.assert_allclose(flat(sol.y1), np.tile(flat(sol.y1)[:1], (5, 1)), atol=1e-12)
+
+
+def test_support():
+    """Section 3.5: a surface with a corner, entered at x = x_c and left at vanishing contact force."""
+    for omega, y0 in ((1.4, (1.0, 0.3)), (0.6, (-2.0, 1.0))):
+        ref = reference.solution(reference.Support, 50.0, y0, omega=omega, x_c=0.1)
+        system = gallery.DiscontinuousSupport(omega=omega, x_c=0.1, k_f=4.0, c_f=0.5, f_0=1.0, m=1.0, k=1.0)
+        sol = solve(system, 0.0, 50.0, Motion(*y0), stepsize_controller=pid(1e-10), max_steps=8192)
+        compare(sol, ref, {1: "contact", -1: "release"}, time=1e-8, state=1e-8)
+
+
+@pytest.mark.parametrize("e", [0.9, 0.95])
+def test_impact_oscillator(e):
+    """Newton's restitution; and pitfall 33: backwards in time to where it came from (e -> 1/e)."""
+    ref = reference.solution(reference.ImpactOscillator, 40.0, (1.0, 0.0), e=e)
+    run = dict(stepsize_controller=pid(1e-10), max_steps=8192)
+    sol = solve(Hammer(e=e), 0.0, 40.0, Motion(1.0, 0.0), **run)
+    compare(sol, ref, {0: "impact"}, time=1e-7, state=1e-7)
+    assert len(sol.events) >= 10
+    back = solve(Hammer(e=e), 40.0, 0.0, sol.y1, **run)
+    # Backwards the dissipation is growth.
+    np.testing.assert_allclose(flat(back.y1), [1.0, 0.0], atol=1e-5)
+    np.testing.assert_allclose(times(back), times(sol)[::-1], atol=1e-5)
+
+
+def test_ball_does_not_fall_through_the_floor():
+    """Pitfall 4: 30 bounces with dt0 = 1e-2, the last flights far shorter than that."""
+    t1 = reference.bouncing_ball(3.6, e=0.8).accumulation - 0.004
+    ref = reference.bouncing_ball(t1, e=0.8)
+    assert len(ref.impact_times) >= 27
+    sol = solve(gallery.BouncingBall(e=0.8), 0.0, t1, Motion(1.0, 0.0), dt0=1e-2)
+    np.testing.assert_allclose(times(sol), ref.impact_times, atol=1e-12)
+    np.testing.assert_allclose(flat(sol.y1), ref.y, atol=1e-12)
+    assert np.all(np.asarray(sol.events.y_after.x)[: len(sol.events)] > -1e-15)
+
+
+def test_impacts_that_accumulate():
+    """Pitfall 16: infinitely many impacts end with a status of their own at the closed form's time and state."""
+    exact = reference.bouncing_ball(0.1, e=0.6, v0=0.5).accumulation
+    sol = solve(gallery.BouncingBall(e=0.6), 0.0, 10.0, Motion(1.0, 0.5), throw=False)
+    assert sol.result == RESULTS.accumulation_reached
+    np.testing.assert_allclose(sol.t1, exact, rtol=1e-12)
+    np.testing.assert_allclose(flat(sol.y1), [0, 0], atol=1e-12)
+
+
+def relay_times(p, T, t1):
+    """Switching times of the thermostat from below T_high, on."""
+    t, on, out = 0.0, True, []
+    while True:
+        rest, goal = p.T_env + 30 * on, p.T_high if on else p.T_low
+        t += np.log((T - rest) / (goal - rest)) / p.a
+        if t > t1:
+            return np.array(out)
+        out.append(t)
+        T, on = goal, not on
+
+
+def test_thermostat():
+    """A relay with hysteresis, closed form; it starts between its surfaces, on by `mode`."""
+    p = Thermostat(a=0.7)
+    sol = solve(p, 0.0, 10.0, Heat(20.0), mode={"heater": 1}, stepsize_controller=pid(1e-10))
+    exact = relay_times(p, 20.0, 10.0)
+    np.testing.assert_allclose(times(sol), exact, atol=1e-8)
+    assert itinerary(sol) == [("heater", 1 - i % 2, i % 2) for i in range(len(exact))]
+
+
+def test_relay_without_hysteresis_is_told():
+    sol = solve(Thermostat(T_high=18.0), 0.0, 10.0, Heat(16.0), throw=False)
+    assert sol.result == RESULTS.stuck_in_events
+
+
+# Section 2.1.
+
+
+def test_transversal_intersection():
+    """Example 2.1: (4 t, ...) crosses x2 = c once."""
+    sol = solve(gallery.TransversalIntersection(), 0.0, 2.0, _plane(0.0, 2.0))
+    np.testing.assert_allclose(times(sol), [0.5], atol=1e-14)
+    np.testing.assert_allclose(flat(sol.y1), [6 * 0.5 + 2 * 1.5, 1 - 6 * 1.5], atol=1e-13)
+
+
+def _plane(x1, x2):
+    return type(gallery.THESIS["example 2.2"].y0)(x1, x2)
+
+
+def test_attraction_sliding():
+    """Example 2.2: slides with x1' = 5 from where it meets x2 = c, (2.19)-(2.20)."""
+    sol = solve(gallery.AttractionSliding(), 0.0, 3.0, _plane(0.0, 3.0))
+    np.testing.assert_allclose(times(sol), [1.0], atol=1e-14)
+    assert itinerary(sol) == [("surface", 1, 0)]
+    np.testing.assert_allclose(flat(sol.y1), [6 + 5 * 2, 1.0], atol=1e-13)
+
+
+def test_repulsion_sliding():
+    """Example 2.3, (2.25): not unique unless `mode` says which; then any of the three."""
+    system = gallery.RepulsionSliding()
+    sol = solve(system, 0.0, 1.0, _plane(0.0, 1.0), throw=False)
+    assert sol.result == RESULTS.repulsive_sliding
+    with pytest.raises(Exception, match="not unique"):
+        solve(system, 0.0, 1.0, _plane(0.0, 1.0))
+    for mode, end in ((0, (-5.0, 1.0)), (1, (-6.0, 3.0)), (-1, (-2.0, -5.0))):
+        sol = solve(system, 0.0, 1.0, _plane(0.0, 1.0), mode={"surface": jnp.asarray(mode)})
+        np.testing.assert_allclose(flat(sol.y1), end, atol=1e-13)
+        assert len(sol.events) == 0 and sol.mode1[0] == mode
+
+
+def test_points_of_one_dimension():
+    """(2.3), examples 2.4 and 2.5: rest at x = 0; leave it; stay on it if told to."""
+    line = type(gallery.THESIS["(2.3)"].y0)
+    sol = solve(gallery.SlidingPoint(), 0.0, 5.0, line(2.0))
+    np.testing.assert_allclose(times(sol), [2.0], atol=1e-14)
+    assert sol.y1.x == 0
+    assert solve(gallery.RepellingPoint(), 0.0, 1.0, line(0.0), throw=False).result == RESULTS.repulsive_sliding
+    sol = solve(gallery.StickingPoint(), 0.0, 1.0, line(0.0), throw=False)
+    assert sol.result == RESULTS.repulsive_sliding  # x = 3 t starts there too
+    sol = solve(gallery.StickingPoint(), 0.0, 1.0, line(0.0), mode={"surface": 0}, throw=False)
+    assert sol.result == RESULTS.successful and sol.y1.x == 0 and sol.mode1[0] == 0
+    np.testing.assert_allclose(solve(gallery.StickingPoint(), 0.0, 1.0, line(1.0)).y1.x, 4.0, atol=1e-13)
+
+
+# Several surfaces.
+
+
+def pair_exact(p, t1):
+    """The coupled pair from (1, 2): x slides from t_a, both slide from t_b, x leaves at t_c."""
+    w, g, c = float(p.w), float(p.g), float(p.c)
+    t_a = min(r.real for r in np.roots([w / 2, -2 - c, 1]) if r.real > 0)
+    # Then λ_x = (w t - c) / 2 and y' = g - 2 - c λ_x.
+    slope, bend = g - 2 + c * c / 2, -c * w / 4
+    y = 2 + (g - c - 2) * t_a
+    t_b = min(r.real for r in np.roots([bend, slope, y - slope * t_a - bend * t_a**2]) if r.real > t_a)
+    det = 4 - c * c
+    t_c = (det + c * g) / (2 * w)
+    # Then y slides with λ_y = (g - c) / 2 and x' = w t - 2 - c λ_y, which starts from zero.
+    x = w / 2 * (t1 - t_c) ** 2
+    return [t_a, t_b, t_c], [x, 0.0]
+
+
+@pytest.mark.parametrize("c", [0.0, 0.5])
+def test_sliding_on_two_surfaces(c):
+    """Pitfall 15: on one surface, on the intersection of two, and tangentially off one of them."""
+    p = Pair(c=c)
+    t, y = pair_exact(p, 26.0)
+    sol = solve(p, 0.0, 26.0, Plane(1.0, 2.0), stepsize_controller=pid(1e-10))
+    assert itinerary(sol) == [("a", 1, 0), ("b", 1, 0), ("a", 0, 1)]
+    np.testing.assert_allclose(times(sol), t, atol=1e-10)
+    np.testing.assert_allclose(flat(sol.y1), y, atol=1e-9)
+
+
+def test_two_surfaces_met_at_one_instant():
+    """Pitfall 7: x and y reach zero together, and both slide from there."""
+    p = Pair(w=0.0, g=0.0, c=0.5)
+    sol = solve(p, 0.0, 2.0, Plane(1.0, 1.0))
+    np.testing.assert_allclose(times(sol), 0.4, atol=1e-13)
+    assert np.all(sol.mode1 == 0)
+    np.testing.assert_allclose(flat(sol.y1), 0, atol=1e-14)
+
+
+def test_long_sliding_does_not_drift():
+    """Pitfall 14: 1000 time units on a circle, a surface which is not affine."""
+    p = Circle()
+    sol = solve(p, 0.0, 1000.0, Plane(1.5, 0.0), stepsize_controller=pid(1e-9), max_steps=100_000)
+    r = 1.5 * np.exp(0.5 * (1 - np.cos(times(sol)[0])) - times(sol)[0])
+    np.testing.assert_allclose(r, 1, atol=1e-8)
+    np.testing.assert_allclose(flat(sol.y1), [np.cos(1000), np.sin(1000)], atol=1e-5)
+    assert abs(np.hypot(*flat(sol.y1)) - 1) < 1e-15 * 4
+    assert len(sol.events) == 1
+
+
+# Impacts, friction, a relay and a clock together.
+
+
+@pytest.fixture(scope="module")
+def puck():
+    return solve(Bumper(), 0.0, 4.0, Puck(0.0, 1.0, 0.0), stepsize_controller=pid(1e-10))
+
+
+def test_impacts_flip_friction_and_relay(puck):
+    """Pitfalls 12, 35: an impact reverses v, hence friction's sign and the relay, at the same instant."""
+    x, v, t, mu = 0.0, 1.0, 0.0, 0.1
+    events, motor, on = [], 0.0, 1
+    while True:
+        a = -mu * (1.0 if t < 2 else 2.0) * np.sign(v)
+        candidates = [("clock", 2 - t)] if t < 2 else []
+        gap = np.sign(v) - x
+        tau = (np.sqrt(v * v + 2 * a * gap) - abs(v)) / a * np.sign(v) if v * v + 2 * a * gap > 0 else np.inf
+        candidates += [("wall", tau), ("stop", -v / a), ("end", 4 - t)]
+        name, tau = min(candidates, key=lambda c: c[1])
+        x, v, t, motor = x + v * tau + a * tau**2 / 2, v + a * tau, t + tau, motor + on * tau
+        if name == "end":
+            break
+        events.append((name, t))
+        assert name != "stop"
+        if name == "wall":
+            v = -0.9 * v
+            on = 1 if v > 0.5 else 0 if v < -0.5 else on
+    sol = puck
+    np.testing.assert_allclose(flat(sol.y1), [x, v, motor], atol=1e-9)
+    walls = [(e.switch, float(e.t)) for e in sol.events if e.switch in ("left", "right")]
+    np.testing.assert_allclose([t for _, t in walls], [t for n, t in events if n == "wall"], atol=1e-9)
+    for e in sol.events:
+        if e.switch in ("left", "right"):
+            assert e.mode_after["rub"] == -e.mode_before["rub"] != 0
+
+
+@pytest.mark.parametrize("order", [(4, 3, 2, 1, 0), (2, 0, 4, 1, 3)])
+def test_order_of_declaration_does_not_matter(puck, order):
+    """Pitfall 32."""
+    sol = solve(Bumper(order=order), 0.0, 4.0, Puck(0.0, 1.0, 0.0), stepsize_controller=pid(1e-10))
+    np.testing.assert_allclose(flat(sol.y1), flat(puck.y1), atol=1e-12)
+    assert len(sol.events) == len(puck.events)
+    np.testing.assert_allclose(times(sol), times(puck), atol=1e-12)
