@@ -173,9 +173,10 @@ def _orbit(args: argparse.Namespace) -> int:
 
 
 def _is_ours(error: BaseException) -> bool:
-    """Whether this package raised it, and not a method of the user's model."""
-    frames = list(traceback.walk_tb(error.__traceback__))
-    return str(frames[-1][0].f_globals.get("__name__", "")).partition(".")[0] == __package__
+    """Whether a `raise` of this package made it, and not the user's model or a bug."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    package = str(pathlib.Path(__file__).parent)
+    return last.filename.startswith(package) and (last.line or "").startswith("raise ")
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Scalar
 
 
+UNROLLED = 5  # steps of Newton's method on a root before a loop takes over
 DEPTH = 40  # bisections: closer roots than 2**-40 of a step are one
 
 
@@ -110,34 +111,32 @@ def _polish(c: Float[Array, " coefficients"]) -> Scalar:
     slopes = [n * (b - a) for a, b in zip(values[:-1], values[1:])]
     eps = jnp.finfo(c.dtype).eps
 
-    def improve(state: tuple, bisect: Any = np.False_) -> tuple:
-        low, high, u, _, count = state
-        value = _value(values, u)
+    def improve(state: tuple) -> tuple:
+        low, high, u, done, count = state
+        value, slope = _value(values, u), _value(slopes, u)
         low = jnp.where(value > 0, u, low)
         high = jnp.where(value > 0, high, u)
-        slope = _value(slopes, u)
         newton = u - value / slope
-        inside = (newton > low) & (newton < high)
-        new = jnp.where(inside & ~bisect, newton, 0.5 * (low + high))
+        inside = (newton >= low) & (newton <= high)
+        step = jnp.abs(newton - u)
+        # Every third step bisects, unless Newton has all but halted: a flat polynomial cannot stall the search.
+        trusted = inside & ((count % 3 != 2) | (step < 1e-2))
         exact = (value == 0) & (slope < 0)
-        new = jnp.where(exact, u, new)
-        done = exact | (jnp.abs(new - u) <= 4 * eps) | (high - low <= eps)
+        new = jnp.where(done | exact, u, jnp.where(trusted, newton, 0.5 * (low + high)))
+        # Newton's method squares the error: after a short step of its own what is left is rounding.
+        done = done | exact | (trusted & (step <= jnp.sqrt(eps))) | (high - low <= 4 * eps)
         return low, high, new, done, count + 1
 
     def busy(state: tuple) -> Bool[Array, ""]:
         *_, done, count = state
         return ~done & (count < 100)
 
-    def again(state: tuple) -> tuple:
-        # Every third step bisects: a flat polynomial cannot stall the search.
-        return improve(state, state[-1] % 3 == 2)
-
     # A root at the very end is no place to start: an earlier one may be meant.
     guess = jnp.where(c[-1] < 0, jnp.clip(c[0] / (c[0] - c[-1]), 0.0, 1.0), 0.5)
     state = (jnp.zeros_like(guess), jnp.ones_like(guess), guess, jnp.zeros((), bool), jnp.zeros((), jnp.int32))
-    for _ in range(6):
+    for _ in range(UNROLLED):
         state = improve(state)
-    return jax.lax.while_loop(busy, again, state)[2]
+    return jax.lax.while_loop(busy, improve, state)[2]
 
 
 def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], Scalar]:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
+import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -304,12 +305,21 @@ class Model(eqx.Module):
                 # It cannot but cross; at a double root the sign of dh/dt is rounding.
                 side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
                 trial[k] = jnp.where(at[k], side, mode[k])
-        for _ in range(2 * len(sgns) + 1 if len(sgns) > 1 else 1):
-            trial, wrong = self._amend(sgns, at, leaves, trial, look(trial))
-        if len(sgns) > 1:
-            _, wrong = self._amend(sgns, at, leaves, trial, look(trial))
+        if len(sgns) == 1:
+            trial, wrong = self._amend(sgns, at, leaves, trial, look(trial))[0], false
         else:
-            wrong = false
+            # One release or taking back a round, until nothing is violated; so many rounds do for all to change twice.
+            def amend(carry: tuple) -> tuple:
+                count, trial, _ = carry
+                return count + 1, *self._amend(sgns, at, leaves, trial, look(trial))
+
+            def unsettled(carry: tuple) -> Bool[Array, ""]:
+                count, _, wrong = carry
+                return wrong & (count < 2 * len(sgns) + 2)
+
+            trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
+            begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
+            _, trial, wrong = lax.while_loop(unsettled, amend, begin)
 
         _, rates, slopes = look(trial)
         roots = list(state.roots)
@@ -345,5 +355,5 @@ class Model(eqx.Module):
             again = retake & (jnp.argmax(back) == i)
             taken = jnp.where(slopes[k] < 0, 0, -trial[k])
             side = jnp.where((s[k] >= 0) == (slopes[k] < 0), 1, -1)  # where dh/dt = slope (s - λ) points
-            out[k] = jnp.where(first, side, jnp.where(again, taken, trial[k]))
+            out[k] = jnp.where(first, side, jnp.where(again, taken, trial[k])).astype(jnp.int32)
         return out, release | retake

@@ -194,6 +194,8 @@ class _Flow(eqx.Module):
 
         t_next = jnp.where(c.t + c.dt >= self.t1, self.t1, c.t + c.dt)
         y1, error, ks, _ = stepper(flow, c.t, t_next, c.y, c.f)
+        # An error that is not a number is too large.
+        error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
         terms = dfx.ODETerm(lambda t, y, args: flow(t, y))
         keep, a, b, _, controller, outcome = self.controller.adapt_step_size(
             c.t, t_next, c.y, y1, None, error, stepper.solver.error_order(terms), c.controller
@@ -280,8 +282,12 @@ class _Flow(eqx.Module):
             result = RESULTS.where(full, RESULTS.max_events_reached, result)
         bad = ~jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((y, f))]).all()
         result = RESULTS.where(bad, RESULTS.nonfinite_field, result)
-        tiny = ~moved & (t + dt <= t)
-        result = RESULTS.where(tiny & (result == RESULTS.successful), RESULTS.dt_min_reached, result)
+        # Rejected again and again, down to nothing: at a place where the field ends, or where it is too rough.
+        tiny = ~moved & ((t + dt <= t) | (dt <= 1e-6 * float(jnp.finfo(t.dtype).eps) * (self.t1 - self.t0)))
+        ended = jnp.stack([jnp.any(~jnp.isfinite(x)) for x in jax.tree.leaves(y1)]).any()
+        tiny = tiny & (result == RESULTS.successful)
+        result = RESULTS.where(tiny & ended, RESULTS.nonfinite_field, result)
+        result = RESULTS.where(tiny & ~ended, RESULTS.dt_min_reached, result)
         result = RESULTS.where(c.active, result, c.result)
         active = c.active & ~done & (result == RESULTS.successful)
         meter = self.meter.step(c.meter, jnp.where(active, (t - self.t0) / (self.t1 - self.t0), 1.0))

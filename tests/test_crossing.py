@@ -9,7 +9,15 @@ import pytest
 from models import Roots
 
 import nsjax
-from nsjax._crossing import deflate, elevate, evaluate, first_root, no_root, nodes, to_bernstein, to_chebyshev
+from nsjax._crossing import deflate, elevate, first_root, no_root, nodes, to_bernstein, to_chebyshev
+
+
+def evaluate(c, u):
+    """A polynomial in Bernstein form, by de Casteljau's scheme."""
+    c = np.asarray(c)
+    while c.shape[-1] > 1:
+        c = c[..., :-1] + u * (c[..., 1:] - c[..., :-1])
+    return c[..., 0]
 
 
 def bernstein(power: np.ndarray) -> np.ndarray:

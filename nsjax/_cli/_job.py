@@ -168,7 +168,7 @@ def _parameter(field: Any, text: str) -> Any:
         return text.lower() == "true"
     value = _value(text, what)
     if field.type in (int, "int"):
-        if isinstance(value, list) or not value.is_integer():
+        if isinstance(value, list) or value != int(value):
             raise UsageError(f"{what} must be an integer, but got {text!r}.")
         return int(value)
     return jnp.asarray(value) if isinstance(value, list) else value

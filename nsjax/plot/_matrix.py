@@ -86,7 +86,15 @@ def multipliers(orbit: Any, *, ax: "Axes | None" = None) -> "Axes":
     for those, fill, label in ((~trivial, "C3", "Floquet multipliers"), (trivial, "white", "along the orbit")):
         if those.any():
             shown = values[those]
-            ax.plot(shown.real, shown.imag, "o", markerfacecolor=fill, markeredgecolor="C3", label=label, clip_on=False)
+            ax.plot(
+                np.real(shown),
+                np.imag(shown),
+                "o",
+                markerfacecolor=fill,
+                markeredgecolor="C3",
+                label=label,
+                clip_on=False,
+            )
     ax.set_aspect("equal")
     ax.set_xlabel("Re λ [-]")
     ax.set_ylabel("Im λ [-]")

@@ -78,6 +78,7 @@ def _draw_events(ax: "Axes", sol: Solution, x: str, y: str) -> None:
 
 
 def _draw_surfaces(ax: "Axes", sol: Solution, x: str, y: str) -> None:
+    ax.margins(0.08)  # room for the signs beside a surface that the trajectory slides on
     xlim, ylim = ax.get_xlim(), ax.get_ylim()
     along = [np.linspace(*lim, GRID) for lim in (xlim, ylim)]
     plane = np.stack(np.meshgrid(*along), axis=-1)
@@ -94,7 +95,7 @@ def _draw_surfaces(ax: "Axes", sol: Solution, x: str, y: str) -> None:
             h = jax.vmap(lambda point, g=guard: g(sol.system, sol.t0, unravel(point)))(plane)
             h = np.asarray(h).reshape(GRID, GRID)
             if h.min() < 0 < h.max():
-                _draw_surface(ax, switch, *along, h, style, drawn)
+                _draw_surface(ax, switch, along[0], along[1], h, style, drawn)
     ax.set_xlim(xlim)
     ax.set_ylim(ylim)
 
