@@ -25,7 +25,7 @@ from scipy.integrate import solve_ivp
 
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-import reference  # noqa: E402
+import reference
 
 
 M, C, K, F_SLIP, F_STICK = 1.0, 0.0, 1.0, 1.0, 2.0

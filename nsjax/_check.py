@@ -7,7 +7,6 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-
 from diffrax._root_finder import use_stepsize_tol
 
 from ._structure import is_affine, is_constant
@@ -43,11 +42,15 @@ def check_solve(
     for leaf in leaves:
         kind = jnp.result_type(leaf)
         if jnp.issubdtype(kind, jnp.complexfloating):
-            raise TypeError("Argument `y0` must be real, but has a complex leaf; split it into real and imaginary part.")
+            raise TypeError(
+                "Argument `y0` must be real, but has a complex leaf; split it into real and imaginary part."
+            )
         if not isinstance(leaf, (float, int)) and not jnp.issubdtype(kind, jnp.floating):
             raise TypeError(f"Argument `y0` must be of floating point dtype, but has a leaf of dtype {kind}.")
         if isinstance(leaf, (bool, int)):
-            raise TypeError(f"Argument `y0` must hold floating point numbers, but has the integer {leaf!r}; write {leaf}.0.")
+            raise TypeError(
+                f"Argument `y0` must hold floating point numbers, but has the integer {leaf!r}; write {leaf}.0."
+            )
     dtype = jnp.result_type(*leaves)
     dtype = jnp.result_type(float) if all(isinstance(x, float) for x in leaves) else dtype
     y0 = jax.tree.map(lambda x: jnp.asarray(x, dtype), y0)
@@ -76,8 +79,8 @@ def _root_finder(solver: Any, controller: Any) -> Any:
     open_ = [n for n in ("rtol", "atol", "norm") if getattr(solver.root_finder, n) is use_stepsize_tol]
     if open_ and not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
         raise ValueError(
-            "Argument `stepsize_controller` must be adaptive for an implicit solver whose root finder has no tolerances, "
-            "but got a fixed one. Use `diffrax.PIDController(rtol=..., atol=...)`, or pass "
+            "Argument `stepsize_controller` must be adaptive for an implicit solver whose root finder has no "
+            "tolerances, but got a fixed one. Use `diffrax.PIDController(rtol=..., atol=...)`, or pass "
             "`root_finder=diffrax.VeryChord(rtol=..., atol=..., norm=optimistix.max_norm)` to the solver."
         )
     return eqx.tree_at(
@@ -103,8 +106,8 @@ def _controller(controller: Any, dtype: Any) -> dfx.AbstractStepSizeController:
             else "Loosen the tolerance."
         )
         raise ValueError(
-            f"Argument `stepsize_controller` must have a tolerance that {dtype} can hold (rtol >= {4 * eps:.1e}), but got "
-            f"rtol = {rtol:.1e}. {cure}"
+            f"Argument `stepsize_controller` must have a tolerance that {dtype} can hold (rtol >= {4 * eps:.1e}), but "
+            f"got rtol = {rtol:.1e}. {cure}"
         )
     return controller
 
@@ -117,8 +120,8 @@ def _given(system: System, mode: Any) -> dict[str, Any]:
         values = list(mode)
         if len(values) != len(switches):
             raise ValueError(
-                f"Argument `mode` must have one value for each of the {len(switches)} switches ({', '.join(switches)}), "
-                f"but got {len(values)}."
+                f"Argument `mode` must have one value for each of the {len(switches)} switches "
+                f"({', '.join(switches)}), but got {len(values)}."
             )
         mode = {n: v for (n, k), v in zip(switches.items(), values) if not isinstance(k, impact)}
     for name, value in mode.items():
@@ -185,8 +188,8 @@ def _check_guard(owner: str, name: str, guard: Any, system: System, t: Scalar, y
         if not isinstance(part, jax.ShapeDtypeStruct) or part.shape != () or part.dtype != t.dtype:
             got = part if not isinstance(part, jax.ShapeDtypeStruct) else f"{part.dtype}{list(part.shape)}"
             raise ValueError(
-                f"`{owner}.{name}` must return a scalar of dtype {t.dtype} (or a tuple of them, meaning their minimum), "
-                f"but returned {got}. For many surfaces define a switch for each, or override `switches`."
+                f"`{owner}.{name}` must return a scalar of dtype {t.dtype} (or a tuple of them, meaning their "
+                f"minimum), but returned {got}. For many surfaces define a switch for each, or override `switches`."
             )
 
 
@@ -203,7 +206,9 @@ def _check_sgn(owner: str, k: int, switch: sgn, system: System, field: Any, zero
         )
     bound = switch.bound(system)
     if jnp.shape(bound) != ():
-        raise ValueError(f"`{owner}.{switch.name}.breakaway` must return a scalar, but its shape is {jnp.shape(bound)}.")
+        raise ValueError(
+            f"`{owner}.{switch.name}.breakaway` must return a scalar, but its shape is {jnp.shape(bound)}."
+        )
 
 
 def _check_impact(
@@ -221,7 +226,8 @@ def _check_impact(
         want = jax.eval_shape(lambda: y)
         if jax.tree.structure(after) != jax.tree.structure(want) or _shape(after) != _shape(want):
             raise ValueError(
-                f"`{owner}.{name}.reset` must return a state of the structure {_shape(want)}, but returned {_shape(after)}."
+                f"`{owner}.{name}.reset` must return a state of the structure {_shape(want)}, but "
+                f"returned {_shape(after)}."
             )
     elif is_constant(lambda sk: field(zeros[:k] + (sk,) + zeros[k + 1 :]), zeros[k]):
         raise ValueError(

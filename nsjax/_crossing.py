@@ -7,7 +7,6 @@ that each root is isolated or excluded.
 
 import functools as ft
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -183,8 +182,7 @@ def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], 
         local = jnp.where(level == 0, c, _restrict(c, a * width, (a + 1) * width))
         return level, index, local, *look(local, level), over
 
-    integer = jnp.int64 if jax.config.jax_enable_x64 else jnp.int32
-    zero = jnp.zeros((), integer)
+    zero = jnp.zeros((), jnp.result_type(int))
     free, sure = look(c, zero)
     level, index, local, free, _, over = jax.lax.while_loop(busy, walk, (zero, zero, c, free, sure, free))
     found = ~over & ~free

@@ -61,9 +61,7 @@ def _arrival_jvp(primals: Any, tangents: Any) -> tuple[tuple[Scalar, Y], tuple[S
     model, state = args[0], args[4]
     moved = eqx.filter_jvp(lambda args: _step_to(te, stepper, args)[0], (args,), (tangents[3],))[1]
     moved = jax.tree.map(lambda y, d: jnp.zeros_like(y) if d is None else d, y_end, moved)
-    change = eqx.filter_jvp(
-        lambda y, args: _guard(te, y, args), (y_end, args), (moved, tangents[3])
-    )[1]
+    change = eqx.filter_jvp(lambda y, args: _guard(te, y, args), (y_end, args), (moved, tangents[3]))[1]
     change = jnp.zeros_like(te) if change is None else change
     f = model.flow(te, y_end, state)
     slope = jax.jvp(lambda t, y: _guard(t, y, args), (te, y_end), (jnp.ones_like(te), f))[1]
@@ -221,9 +219,7 @@ def land(
             # Its new surface may be the one just crossed (no hysteresis): then its root here is known.
             assert guards is not None
             first = next(i for i, s in enumerate(model.slots) if s.switch == k)
-            noise = model.rounding(
-                lambda t, y, first=first: (model.guards(t, y, state_after)[first][0],), te, after
-            )[0]
+            noise = model.rounding(lambda t, y, first=first: (model.guards(t, y, state_after)[first][0],), te, after)[0]
             roots[k] = jnp.where(fired[k], (jnp.abs(guards[first][0]) <= noise).astype(jnp.int32), roots[k])
         elif isinstance(switch, impact):
             t_after, after, roots[k], failed = _rebounded(

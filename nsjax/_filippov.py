@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._structure import is_affine, is_constant
-from ._system import AbstractSwitch, System, impact, relay, sgn
+from ._system import AbstractSwitch, impact, relay, sgn, System
 from ._types import Mode, Scalar, Y
 
 

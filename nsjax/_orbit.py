@@ -5,6 +5,7 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.core
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
@@ -98,7 +99,15 @@ def _base_point(system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any, me
 
 @eqx.filter_jit
 def _shoot(
-    system: System, t0: Scalar, y0: Y, period: Scalar, order: int, mode: Any, method: dict, tol: float, max_iterations: int
+    system: System,
+    t0: Scalar,
+    y0: Y,
+    period: Scalar,
+    order: int,
+    mode: Any,
+    method: dict,
+    tol: float,
+    max_iterations: int,
 ) -> Orbit:
     """Newton's method on y(t0 + period) = y0, and everything said of the orbit."""
     autonomous = system.period is None
@@ -114,7 +123,7 @@ def _shoot(
     def flow(system: System, x: Array, period: Scalar) -> Array:
         sol = solve(system, t0, t0 + period, unravel(x), mode=mode, throw=False, **method)
         # A solution that ended early is no solution: Newton's method must not be led by it.
-        ok = (sol.result == RESULTS.successful)
+        ok = sol.result == RESULTS.successful
         return jnp.where(ok, jfu.ravel_pytree(sol.y1)[0], jnp.nan)
 
     if autonomous:

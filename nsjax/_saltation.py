@@ -126,9 +126,7 @@ def _over_log(system: System, events: Events, fn: Any) -> Array:
     model = Model(system, jnp.ones((), dtype), jnp.zeros((), dtype), template)
 
     def one(t: Scalar, y: Y, switch: Array, before: Array, after: Array) -> Array:
-        options = [
-            fn(model, t, y, k, tuple(before), tuple(after)) for k in range(len(model.switches))
-        ]
+        options = [fn(model, t, y, k, tuple(before), tuple(after)) for k in range(len(model.switches))]
         return jnp.select([switch == k for k in range(len(options))], options, jnp.nan)
 
     return jax.vmap(one)(events.t, events.y_before, events.switch, events.mode_before, events.mode_after)

@@ -19,11 +19,12 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """Diffrax's results, and those of nonsmooth flows."""
 
     max_events_reached = (
-        "The maximum number of events was reached. Increase `max_events`; if events crowd together, look at `sol.events`."
+        "The maximum number of events was reached. Increase `max_events`; if events crowd together, look at "
+        "`sol.events`."
     )
     accumulation_reached = (
-        "Impacts accumulated (Zeno): infinitely many in a finite time. `sol.t1` and `sol.y1` hold the time and the state "
-        "at the accumulation point, where contact begins to last."
+        "Impacts accumulated (Zeno): infinitely many in a finite time. `sol.t1` and `sol.y1` hold the time and the "
+        "state at the accumulation point, where contact begins to last."
     )
     repulsive_sliding = (
         "The start lies on a surface which both fields leave (2.25): the solution is not unique. Choose one by "
@@ -40,8 +41,8 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     nonfinite_field = "The vector field or an indicator function returned a value that is not finite (NaN or infinity)."
     wrong_mode = "Argument `mode` places the start on one side of a surface, but `y0` lies clearly on the other."
     wrong_reset = (
-        "A reset left the state on the wrong side of its surface (h < 0), or still approaching it (dh/dt < 0). Check the "
-        "signs in the method decorated with `.reset` (or a coefficient of restitution below 0)."
+        "A reset left the state on the wrong side of its surface (h < 0), or still approaching it (dh/dt < 0). Check "
+        "the signs in the method decorated with `.reset` (or a coefficient of restitution below 0)."
     )
     orbit_not_found = (
         "No periodic orbit was found: Newton's method on the shooting equations did not converge. Start nearer to one "
@@ -161,4 +162,3 @@ class Solution(eqx.Module):
 
     def __call__(self, t: Any, left: bool = True) -> Y:
         return self.evaluate(t, left)
-

@@ -4,6 +4,7 @@ Under `vmap` every lane is in its own mode and at its own time: it takes a step,
 for the segments of the others.
 """
 
+import functools as ft
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -18,14 +19,14 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from ._check import check_model, check_solve
 from ._compact import compact_cond
 from ._crossing import deflate, elevate, nodes, to_bernstein, to_chebyshev
-from ._event import Landing, land
+from ._event import land, Landing
 from ._filippov import Model, State
 from ._save import Log, Saved
 from ._solution import Events, RESULTS, Solution
 from ._step import stack, Stepper
 from ._structure import is_affine
-from ._system import arrays_of, impact, relay, sgn, System
-from ._types import Mode, Scalar, Y
+from ._system import arrays_of, impact, relay, System
+from ._types import Scalar, Y
 
 
 class _Carry(eqx.Module):
@@ -106,7 +107,7 @@ def _size(model: Model, k: int, t: Scalar, y: Y, state: State, s: tuple) -> Scal
     """The largest that dh/dt could be for the components of the field: what its rounding is measured by."""
     f = model.field(t, y, s)
     total = jnp.zeros((), t.dtype)
-    for i, leaf in enumerate(jax.tree.leaves(f)):
+    for i in range(len(jax.tree.leaves(f))):
         only = jax.tree.unflatten(
             jax.tree.structure(f),
             [x if i == j else jnp.zeros_like(x) for j, x in enumerate(jax.tree.leaves(f))],
@@ -232,7 +233,17 @@ class _Flow(eqx.Module):
         if model.slots:
             here = (c.t, t_next, c.y, c.f, c.state, lax.stop_gradient(coefficients))
             still = Landing(
-                event, t_next, t_next, y1, y_end, f_end, c.state, jnp.zeros((), jnp.int32), event, points, RESULTS.successful
+                event,
+                t_next,
+                t_next,
+                y1,
+                y_end,
+                f_end,
+                c.state,
+                jnp.zeros((), jnp.int32),
+                event,
+                points,
+                RESULTS.successful,
             )
             there = _landed(busy, self, here, still)
             event = busy & there.found
@@ -276,7 +287,9 @@ class _Flow(eqx.Module):
 
         steps = c.steps + c.active.astype(jnp.int32)
         done = t >= self.t1
-        result = RESULTS.where((steps >= self.max_steps) & ~done & (result == RESULTS.successful), RESULTS.max_steps_reached, result)
+        result = RESULTS.where(
+            (steps >= self.max_steps) & ~done & (result == RESULTS.successful), RESULTS.max_steps_reached, result
+        )
         if model.slots:
             full = (events >= self.max_events) & ~done & (result == RESULTS.successful)
             result = RESULTS.where(full, RESULTS.max_events_reached, result)
@@ -368,13 +381,13 @@ def _run(
     state, result = _start(model, start, y0, given)
     f0 = model.flow(start, y0, state)
 
-    affine = tuple(
-        is_affine(lambda ty, i=i: model.guards(*ty, state)[i], (start, y0)) for i in range(len(model.slots))
-    )
+    def guard(i: int, ty: tuple[Scalar, Y]) -> list[Scalar]:
+        return model.guards(ty[0], ty[1], state)[i]
+
+    affine = tuple(is_affine(ft.partial(guard, i), (start, y0)) for i in range(len(model.slots)))
     terms = dfx.ODETerm(lambda t, y, args: model.flow(t, y, state))
-    first, controller_state = controller.init(
-        terms, start, stop, y0, dt0, None, solver.func, solver.error_order(terms)
-    )
+    func: Any = solver.func
+    first, controller_state = controller.init(terms, start, stop, y0, dt0, None, func, solver.error_order(terms))
     saved = Saved(saveat, max_steps, max_events, start, y0, state.mode, stepper.degree, system)
     request = saved.request
     if request.t0:
@@ -510,8 +523,8 @@ def solve(
     - `system`: the model.
     - `t0`, `t1`: start and end [time].
     - `y0`: the state at `t0`, any pytree of floating point arrays of one dtype.
-    - `mode`: for a start on a surface, `{"name": value}` or one value for each switch: `sgn` +1, -1, or 0 to slide (also
-        on a repulsive surface); `relay` 0 or 1 (needed between its two surfaces, 0 by default).
+    - `mode`: for a start on a surface, `{"name": value}` or one value for each switch: `sgn` +1, -1, or 0 to slide
+        (also on a repulsive surface); `relay` 0 or 1 (needed between its two surfaces, 0 by default).
     - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, or Euler.
     - `stepsize_controller`: by default `diffrax.PIDController` with `rtol = atol = 1e-8` (1e-5 for float32).
     - `saveat`: as in diffrax: `t0`, `t1`, `ts`, `steps`, `fn(t, y, system)`, `dense`.
@@ -522,8 +535,8 @@ def solve(
 
     **Returns:** a `Solution`.
 
-    **Raises:** `TypeError`, `ValueError` for mistakes in the model or the arguments; a runtime error that tells which of
-    `RESULTS` occurred, if `throw`.
+    **Raises:** `TypeError`, `ValueError` for mistakes in the model or the arguments; a runtime error that tells which
+    of `RESULTS` occurred, if `throw`.
     """
     y0, t0, t1, solver, controller, given = check_solve(
         system, t0, t1, y0, mode, solver, stepsize_controller, saveat, max_steps, max_events

@@ -34,6 +34,10 @@ def _combine(base: Any, terms: list[tuple[float, Any]]) -> Any:
     return jax.tree.map(leaf, base, *[k for _, k in terms]) if terms else base
 
 
+def _double() -> bool:
+    return jnp.result_type(float) == jnp.float64
+
+
 @ft.lru_cache
 def _dense_weights(solver_type: type, stages: int, x64: bool) -> tuple[np.ndarray, int]:
     """Dense output at many nodes as weights on (y0, y1, k_1, ..., k_s), and its degree as a polynomial.
@@ -77,18 +81,15 @@ class Stepper(eqx.Module):
                 f"Tsit5, Dopri5, Dopri8, Kvaerno5) or Euler, but got {solver!r}."
             )
         self.solver = solver
-        self.degree = _dense_weights(type(solver), self.stages, bool(jax.config.jax_enable_x64))[1]
-
-    @property
-    def explicit(self) -> bool:
-        return isinstance(self.solver, dfx.AbstractERK)
+        self.degree = _dense_weights(type(solver), self.stages, _double())[1]
 
     def __call__(self, f: Field, t: Scalar, t_next: Scalar, y: Y, f0: Y) -> tuple[Y, Y | None, list[Y], Any]:
         """**Returns:** y at `t_next`, the error estimate (None if the method has none), the increments k, and
         diffrax's result (None when the step cannot fail)."""
         dt = t_next - t
-        if self.explicit:
+        if isinstance(self.solver, dfx.AbstractERK):
             tableau = self.solver.tableau
+            assert isinstance(tableau, dfx.ButcherTableau)
             scale = ft.partial(jax.tree.map, lambda k: dt * k)
             ks, stage = [scale(f0)], y
             for row, c in zip(tableau.a_lower, tableau.c):
@@ -105,7 +106,7 @@ class Stepper(eqx.Module):
 
     def last_slope(self, ks: list[Y], dt: Scalar, f: Field, t: Scalar, y: Y) -> Y:
         """f at the end of the step; free when the first stage of the next step is the last of this one."""
-        if self.explicit and self.solver.tableau.fsal:
+        if isinstance(self.solver, dfx.AbstractERK) and self.solver.tableau.fsal:  # pyright: ignore
             safe = jnp.where(dt == 0, 1, dt)
             return jax.tree.map(lambda k: k / safe, ks[-1])
         return f(t, y)
@@ -122,7 +123,7 @@ class Stepper(eqx.Module):
         return rows
 
     def _values(self, at: np.ndarray) -> np.ndarray:
-        weights, _ = _dense_weights(type(self.solver), self.stages, bool(jax.config.jax_enable_x64))
+        weights, _ = _dense_weights(type(self.solver), self.stages, _double())
         many = len(weights) - 1
         # Interpolation from many nodes to the few asked for, exact for polynomials.
         vander = ft.partial(np.polynomial.chebyshev.chebvander, deg=self.degree)

@@ -226,7 +226,9 @@ def arrays_of(system: System, dtype: Any) -> System:
     for field in dataclasses.fields(system):
         value = getattr(system, field.name)
         if is_float_field(field) and isinstance(value, int) and not isinstance(value, bool):
-            system = eqx.tree_at(lambda m, n=field.name: getattr(m, n), system, float(value), is_leaf=lambda x: x is None)
+            system = eqx.tree_at(
+                lambda m, n=field.name: getattr(m, n), system, float(value), is_leaf=lambda x: x is None
+            )
     return jax.tree.map(convert, system)
 
 

@@ -58,7 +58,12 @@ def fundamental_matrix(
         tol = 1e-10 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-5
         controller = dfx.PIDController(rtol=tol, atol=tol)
     kwargs: dict[str, Any] = dict(
-        mode=mode, solver=solver, stepsize_controller=controller, max_steps=max_steps, max_events=max_events, throw=throw
+        mode=mode,
+        solver=solver,
+        stepsize_controller=controller,
+        max_steps=max_steps,
+        max_events=max_events,
+        throw=throw,
     )
     flat, unravel = jfu.ravel_pytree(y0)
     if method == "autodiff":

@@ -169,7 +169,9 @@ def _parse(key: str) -> tuple[str, tuple[int, ...]] | None:
 
 
 def _kind(entry: Entry) -> tuple[str, tuple[int, ...]]:
-    kind, numbers = _parse(entry.key)
+    parsed = _parse(entry.key)
+    assert parsed is not None
+    kind, numbers = parsed
     return kind or ("table" if len(numbers) == 3 else "section"), numbers
 
 

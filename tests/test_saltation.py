@@ -1,0 +1,212 @@
+"""Saltation matrices three ways: formula, automatic differentiation through the flow, central differences of the flow.
+
+The smooth pieces before and after an event, which the last two have to be freed of, are matrix exponentials here.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array
+from models import flat, Hammer, Motion, pid
+from scipy.linalg import expm
+
+import nsjax
+from nsjax import fundamental_matrix, gallery, saltation_matrices, saltation_matrix, solve, transversality
+
+
+class Swell(nsjax.System):
+    """x'' = -k x - s, s = sgn(x - a sin t): a surface that moves, h = x - a sin t, crossed without sliding."""
+
+    k: float = 1.0
+    a: float = 0.5
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -self.k * y.x - s.surface)
+
+    @nsjax.sgn
+    def surface(self, t, y):
+        return y.x - self.a * jnp.sin(t)
+
+
+class Racket(nsjax.System):
+    """x'' = -g - k x above a plate that moves, x >= a sin t, with Newton's restitution or the same jump by a reset."""
+
+    k: float = 0.3
+    g: float = 1.0
+    a: float = 0.2
+    e: float = 0.7
+    by_reset: bool = False
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -self.g - self.k * y.x + 2 * s.plate)
+
+    @property
+    def switches(self):
+        gap = nsjax.impact(lambda self, t, y: y.x - self.a * jnp.sin(t), name="plate")
+        if not self.by_reset:
+            return (gap.restitution(lambda self: self.e),)
+        return (gap.reset(lambda self, t, y: Motion(y.x, -self.e * y.v + (1 + self.e) * self.a * jnp.cos(t))),)
+
+
+def linear(k, c=0.0):
+    """Jacobian of x'' = -k x - c x'."""
+    return np.array([[0, 1], [-k, -c]])
+
+
+STICK = np.array([[0.0, 1.0], [0.0, 0.0]])
+
+
+@functools.cache
+def runner():
+    # One program a class of system: it serves the derivative and, for its values alone, the differences.
+    @eqx.filter_jit
+    def run(system, y0, t0, t1):
+        def flow(y0):
+            sol = solve(
+                system, t0, t1, Motion(y0[0], y0[1]), stepsize_controller=pid(1e-13), max_steps=20_000, max_events=4
+            )
+            return jnp.stack(sol.y1), (jnp.stack(sol.y1), sol.events)
+
+        return jax.jacfwd(flow, has_aux=True)(y0)
+
+    return run
+
+
+def floats(system):
+    return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, system)
+
+
+def differences(fn, y, *, h=4e-3):
+    """Jacobian by central differences, extrapolated three times: error O(h^6)."""
+    columns = []
+    for unit in np.eye(len(y)):
+        table = [(fn(y + d * unit) - fn(y - d * unit)) / (2 * d) for d in (h, h / 2, h / 4)]
+        for order in (4, 16):
+            table = [(order * b - a) / (order - 1) for a, b in zip(table, table[1:])]
+        columns.append(table[0])
+    return np.stack(columns, -1)
+
+
+def three_ways(system, y0, t0, t1, names, before, after, smooth, exact):
+    """Formula, autodiff and differences across the events of switches `names` against their exact product.
+
+    `smooth` has the Jacobian of the field on each arc; `exact` the saltation matrices."""
+    system, y0 = floats(system), np.asarray(y0)
+    jacobian, (_, events) = runner()(system, y0, t0, t1)
+    assert [e.switch for e in events] == names
+    times = [t0, *(float(e.t) for e in events), t1]
+    for i, e in enumerate(events):
+        assert (e.mode_before[e.switch], e.mode_after[e.switch]) == (before[i], after[i])
+        modes = list(e.mode_before.values()), list(e.mode_after.values())
+        formula = saltation_matrix(system, e.t, e.y_before, e.switch, *modes)
+        want = exact[i](e) if callable(exact[i]) else exact[i]
+        np.testing.assert_allclose(formula, want, rtol=1e-11, atol=1e-11)
+    formulas = np.asarray(saltation_matrices(system, events))
+    assert np.isnan(formulas[len(events) :]).all()
+    whole = expm(smooth[0] * (times[1] - times[0]))
+    for i, a in enumerate(smooth[1:]):
+        whole = expm(a * (times[i + 2] - times[i + 1])) @ formulas[i] @ whole
+    by_differences = differences(lambda y: np.asarray(runner()(system, y, t0, t1)[1][0]), y0)
+    scale = np.abs(whole).max()
+    errors = np.abs(jacobian - whole).max() / scale, np.abs(by_differences - whole).max() / scale
+    print(type(system).__name__, errors)
+    assert errors[0] < 1e-10 and errors[1] < 1e-8
+    if len(events) == 1:  # the event alone
+        unwrap = [np.linalg.inv(expm(a * d)) for a, d in zip(smooth, np.diff(times))]
+        for found in (np.asarray(jacobian), by_differences):
+            np.testing.assert_allclose(unwrap[1] @ found @ unwrap[0], formulas[0], atol=1e-8 * np.abs(formulas[0]).max())
+
+
+# Each case: system, start, t0, t1, modes before and after, Jacobians of the arcs, saltation matrices.
+FALL = linear(1.0, 0.05)
+TRILINEAR = linear(5.0, 0.55)
+JUMP = np.array([[1, 0], [-0.5, 1]])  # -c_f / m
+CASES = {
+    "(3.41)": (gallery.StickSlip(m=2.0, k=1.5), (1.5, -0.3), 0.0, 4.5, ["belt"], [-1], [0],
+        [linear(0.75), STICK], [np.diag([1, 0])]),
+    "(3.41), (3.43)": (gallery.StickSlip(m=2.0, k=1.5), (1.5, -0.3), 0.0, 15.5, ["belt"] * 2, [-1, 0], [0, -1],
+        [linear(0.75), STICK, linear(0.75)], [np.diag([1, 0]), np.array([[1, 0], [-1 / (2 * 0.2), 1]])]),
+    "(3.57)": (gallery.DiscontinuousSupport(), (-0.8, 0.5), 0.3, 1.8, ["support"], [-1], [1],
+        [linear(1), linear(5, 0.5)], [JUMP]),
+    "(3.61)": (gallery.DiscontinuousSupport(), (0.4, 0.3), 0.0, 1.2, ["support"], [1], [-1],
+        [linear(5, 0.5), linear(1)], [np.eye(2)]),
+    "(6.21) a": (gallery.Trilinear(), (0.5, 1.0), 0.2, 1.2, ["lower"], [-1], [1], [FALL, TRILINEAR], [JUMP]),
+    "(6.21) b": (gallery.Trilinear(), (1.3, 0.2), 0.2, 1.6, ["lower"], [1], [-1], [TRILINEAR, FALL], [np.eye(2)]),
+    "(6.22) a": (gallery.Trilinear(), (-0.5, -1.0), 0.2, 1.2, ["upper"], [-1], [1], [FALL, TRILINEAR], [JUMP]),
+    "(6.22) b": (gallery.Trilinear(), (-1.3, -0.2), 0.2, 1.6, ["upper"], [1], [-1], [TRILINEAR, FALL], [np.eye(2)]),
+    "impact": (Hammer(), (1.0, -0.2), 0.0, 2.5, ["wall"], [0], [0], [linear(1, 0.02)] * 2,
+        [lambda e: hammer(e)]),
+    "(3.32)": (Swell(), (1.0, -0.3), 0.5, 2.2, ["surface"], [1], [-1], [linear(1)] * 2,
+        [lambda e: np.array([[1, 0], [2 / (e.y_before.v - 0.5 * np.cos(e.t)), 1]])]),
+    "(3.32), restitution": (Racket(), (0.6, 0.1), 0.5, 2.2, ["plate"], [0], [0], [linear(0.3)] * 2, [lambda e: racket(e)]),
+    "(3.32), reset": (Racket(by_reset=True), (0.6, 0.1), 0.5, 2.2, ["plate"], [0], [0], [linear(0.3)] * 2,
+        [lambda e: racket(e)]),
+}  # fmt: skip
+
+
+def hammer(e):
+    """[[-e, 0], [(a+ + e a-) / v-, -e]]"""
+    before, after = (float(jnp.cos(0.8 * e.t) - 0.02 * y.v - y.x) for y in (e.y_before, e.y_after))
+    return np.array([[-0.8, 0], [(after + 0.8 * before) / float(e.y_before.v), -0.8]])
+
+
+def racket(e):
+    """By hand: gap w = x - a sin t, w' -> -e w', in the frame of the plate, where the surface stands still."""
+    r, a, t = 0.7, 0.2, float(e.t)
+    before, after = e.y_before.v - a * np.cos(t), e.y_after.v - a * np.cos(t)
+    pull = -1 - 0.3 * e.y_before.x + a * np.sin(t)  # w''
+    np.testing.assert_allclose(after, -r * before, rtol=1e-12)
+    return np.array([[-r, 0], [(1 + r) * pull / before, -r]])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_three_ways(case):
+    """Pitfall 19: exact to 1e-8 and not only to the accuracy of an interpolant."""
+    three_ways(*CASES[case])
+
+
+def test_formulas_do_not_depend_on_parameters():
+    """(3.41) is diag(1, 0) for every parameter; (3.43), here with damping, and (3.57) for others than the defaults."""
+    for p in (dict(m=0.7, c=0.2, k=3.0, v_dr=-0.6, F_slip=0.4, F_stick=0.9), dict(c=0.1)):
+        system = gallery.StickSlip(**p)
+        at = system.v_dr, (np.sign(system.v_dr) * system.F_stick - system.c * system.v_dr) / system.k
+        for side in (1, -1):
+            entry = saltation_matrix(system, 0.0, Motion(0.1, at[0]), "belt", side, 0)
+            np.testing.assert_allclose(entry, np.diag([1, 0]), atol=1e-15)
+        leave = saltation_matrix(system, 0.0, Motion(at[1], at[0]), "belt", 0, -int(np.sign(at[0])))
+        excess = np.sign(at[0]) * (system.F_stick - system.F_slip) / system.m
+        corner = 1 - excess * system.c / (system.k * at[0])  # h_β = k x + c v - F_stick; the thesis has c = 0
+        np.testing.assert_allclose(leave, [[1, 0], [-excess / at[0], corner]], rtol=1e-13)
+    support = gallery.DiscontinuousSupport(m=2.0, c_f=0.7, k_f=9.0)
+    contact = saltation_matrix(support, 1.3, Motion(0.0, 0.4), "support", {"support": -1}, {"support": 1})
+    np.testing.assert_allclose(contact, [[1, 0], [-0.35, 1]], atol=1e-15)
+
+
+def test_transversality_of_a_log():
+    """The cosine between normal and trajectory, small where the derivative is about to fail (pitfall 10)."""
+    system = floats(Swell())
+    _, (_, events) = runner()(system, np.array([1.0, -0.3]), 0.5, 2.2)
+    (e,) = events
+    v, t = float(e.y_before.v), float(e.t)
+    normal, speed = np.array([1, -0.5 * np.cos(t)]), np.array([v, 1])
+    acceleration = -float(e.y_before.x) - 1
+    want = abs(normal @ speed) / np.linalg.norm(normal) / np.linalg.norm([v, acceleration, 1])
+    np.testing.assert_allclose(transversality(system, events)[0], want, rtol=1e-12)
+    assert np.isnan(transversality(system, events)[1:]).all()
+    # Autonomous: time does not count.
+    system = floats(gallery.StickSlip())
+    log = solve(system, 0.0, 14.0, Motion(2.0, 0.0), max_events=3).events
+    first, last = transversality(system, log)[:2]
+    v, a = float(log.y_before.v[0]), -float(log.y_before.x[0]) + 1
+    np.testing.assert_allclose(first, a / np.hypot(v, a), rtol=1e-7)
+    np.testing.assert_allclose(last, 1, rtol=1e-12)
+
+
+def test_a_tangency_is_infinite_not_floored():
+    """Pitfall 10."""
+    s = saltation_matrix(gallery.StickSlip(), 0.0, Motion(1.0, 0.2), "belt", -1, 1)  # x' = 0.2, v' = -x + F_slip = 0
+    assert not np.isfinite(s).all()
