@@ -115,8 +115,9 @@ def _batch(args: Any, dims: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[Any], 
 
 def _jvp(primals: Any, tangents: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[Any], list[Any]]:
     pred, (inputs, default) = primals[0], _split(primals[1:], jaxpr)
-    moves, default_moves = _split([ad.instantiate_zeros(t) for t in tangents[1:]], jaxpr)
-    smooth = [i for i, t in enumerate(moves) if jnp.issubdtype(inputs[i].dtype, jnp.inexact)]
+    moves, default_moves = _split(tangents[1:], jaxpr)
+    # What has no tangent must not get one: loops on it would have to carry it.
+    smooth = [i for i, move in enumerate(moves) if type(move) is not ad.Zero]
     kept = [i for i, d in enumerate(default) if jnp.issubdtype(d.dtype, jnp.inexact)]
     branch = jex.jaxpr_as_fun(jaxpr)
 
@@ -131,7 +132,10 @@ def _jvp(primals: Any, tangents: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[A
         return out, [change[i] for i in kept]
 
     out, change = compact_cond(
-        pred, both, (inputs, [moves[i] for i in smooth]), (default, [default_moves[i] for i in kept])
+        pred,
+        both,
+        (inputs, [moves[i] for i in smooth]),
+        (default, [ad.instantiate_zeros(default_moves[i]) for i in kept]),
     )
     full: list[Any] = [ad.Zero(jax.core.ShapedArray(x.shape, jax.dtypes.float0)) for x in out]
     for i, c in zip(kept, change):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._structure import is_affine, is_constant
-from ._system import AbstractSwitch, impact, relay, sgn, System
+from ._system import AbstractSwitch, frozen, impact, relay, sgn, System
 from ._types import Mode, Scalar, Y
 
 
@@ -270,6 +270,7 @@ class Model(eqx.Module):
         **Returns:** the new state, whether the solution is not unique (a repulsive surface (2.25) met without a side),
         and whether no valid assignment was found.
         """
+        self, t, y = frozen((self, t, y))  # modes have no derivative
         sgns = tuple(at)
         false = jnp.zeros((), bool)
         if not sgns:

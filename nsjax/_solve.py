@@ -183,6 +183,7 @@ class _Flow(eqx.Module):
 
     def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list) -> Landing:
         """The step once more, to its first event."""
+        coefficients = lax.stop_gradient(coefficients)
         known = self.model.stacked(self.model.known_roots(state), 0)
         polynomials = deflate(self.stacked(coefficients), known)
         return land(self.model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials)

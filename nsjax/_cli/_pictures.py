@@ -2,6 +2,7 @@
 
 import pathlib
 import re
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -33,10 +34,9 @@ def draw(job: Job, sol: Solution, orbit: Orbit | None, out: pathlib.Path) -> lis
     out.mkdir(parents=True, exist_ok=True)
     stem = re.sub(r"[^\w.]+", "-", job.name.rpartition(":")[2] if not job.from_gallery else job.name).strip("-")
     files = []
+    title = f"{job.name}: {job.title}" if job.from_gallery else stem
     for kind, figure in figures.items():
-        figure.suptitle(
-            f"{job.name}: {job.title}" if job.from_gallery else job.name.rpartition(":")[2], fontsize="medium"
-        )
+        figure.suptitle(textwrap.fill(title, int(11 * figure.get_figwidth())), fontsize="medium")
         files.append(out / f"{stem}-{kind}.png")
         figure.savefig(files[-1], dpi=150)
     return files

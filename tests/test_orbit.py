@@ -1,0 +1,249 @@
+"""Periodic orbits against closed forms and 40-digit references, and what the search says when there is none."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from models import Motion, pid, Plane
+
+import nsjax
+from nsjax import find_orbit, fundamental_matrix, gallery, RESULTS
+
+
+# Dopri8, the default, takes twice as long to compile.
+METHOD = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-13), max_steps=8192, max_events=16)
+
+
+def by_autodiff(orbit, system):
+    return fundamental_matrix(
+        system, orbit.t0, orbit.t0 + orbit.period, orbit.y0, method="autodiff", mode=tuple(orbit.mode), **METHOD
+    )
+
+
+def spans(times, period):
+    """Times between events around the cycle, which do not depend on the base point."""
+    return np.mod(np.diff([*times, times[0]]), period)
+
+
+@pytest.fixture(scope="module")
+def classic():
+    return find_orbit(gallery.StickSlip(), Motion(2.02, 0.0), period=13.54, **METHOD)
+
+
+def test_section_3_4(classic):
+    """Period 10 + π + 2 atan(1/5); stick from x = 0 to x = 2; multipliers 1 and 0 (pitfall 23: singular)."""
+    period = 10 + np.pi + 2 * np.arctan(0.2)
+    np.testing.assert_allclose(classic.period, period, atol=1e-10)
+    assert [e.mode_after["belt"] for e in classic.events] == [0, -1]
+    stick, slip = classic.events
+    np.testing.assert_allclose(float(slip.t - stick.t), 10, atol=1e-10)
+    np.testing.assert_allclose([stick.y_after.x, stick.y_after.v], [0.0, 0.2], atol=1e-10)
+    np.testing.assert_allclose([slip.y_after.x, slip.y_after.v], [2.0, 0.2], atol=1e-10)
+    np.testing.assert_allclose(classic.multipliers, [1, 0], atol=1e-10)
+    assert classic.stable and classic.result == RESULTS.successful and classic.residual < 1e-10
+    assert classic.itinerary == ({"belt": -1}, {"belt": 0}, {"belt": -1})
+    assert "stable periodic orbit of StickSlip" in str(classic) and "13.536" in str(classic)
+
+
+def check_stick_slip(orbit, exact, **parameters):
+    np.testing.assert_allclose(orbit.period, exact.period, atol=1e-10)
+    names = {0: "stick", -1: "slip"}
+    assert [names[e.mode_after["belt"]] for e in orbit.events] == [e[1] for e in exact.events]
+    np.testing.assert_allclose(
+        spans([float(e.t) for e in orbit.events], exact.period), spans([e[0] for e in exact.events], exact.period), atol=1e-10
+    )
+    for e, (_, _, x, v) in zip(orbit.events, exact.events):
+        np.testing.assert_allclose([e.y_after.x, e.y_after.v], [x, v], atol=1e-10)
+    np.testing.assert_allclose(orbit.multipliers, exact.multipliers, atol=1e-9)
+    assert orbit.stable
+
+
+@pytest.mark.parametrize("c", [0.0, 0.1])
+def test_sections_3_4_and_6_7(classic, c):
+    orbit = classic if c == 0 else find_orbit(gallery.StickSlip(c=c), Motion(2.0, 0.0), period=12.635, **METHOD)
+    check_stick_slip(orbit, reference.stick_slip_orbit(c=c))
+    exact = reference.simulate(reference.StickSlip(c=c), reference.mp.mpf(float(orbit.period)), orbit.y0)
+    np.testing.assert_allclose(orbit.monodromy, reference.floats(exact.fundamental), atol=1e-9)
+    if c:
+        np.testing.assert_allclose(by_autodiff(orbit, gallery.StickSlip(c=c)), orbit.monodromy, atol=1e-8)
+
+
+def test_section_2_4():
+    orbit = find_orbit(gallery.FallingStickSlip(), Motion(1.1, 0.0), period=12.0, **METHOD)
+    check_stick_slip(orbit, reference.friction_curve_orbit())
+    np.testing.assert_allclose(by_autodiff(orbit, gallery.FallingStickSlip()), orbit.monodromy, atol=1e-8)
+
+
+def test_section_3_5():
+    """A forced orbit over a surface with a corner; its base point is at t0, as asked for."""
+    system = gallery.DiscontinuousSupport()
+    orbit = find_orbit(system, Motion(1.11, 1.34), **METHOD)
+    exact = reference.support_orbit((1.11, 1.34), omega=1.2)
+    np.testing.assert_allclose(orbit.period, exact.period, rtol=1e-14)
+    np.testing.assert_allclose([orbit.y0.x, orbit.y0.v], exact.y0, atol=1e-10)
+    names = {1: "contact", -1: "release"}
+    assert [names[e.mode_after["support"]] for e in orbit.events] == [e[1] for e in exact.events]
+    np.testing.assert_allclose([float(e.t) for e in orbit.events], [e[0] for e in exact.events], atol=1e-10)
+    np.testing.assert_allclose(orbit.monodromy, exact.monodromy, atol=1e-9)
+    np.testing.assert_allclose(np.sort_complex(orbit.multipliers), np.sort_complex(exact.multipliers), atol=1e-9)
+    np.testing.assert_allclose(by_autodiff(orbit, system), orbit.monodromy, atol=1e-8)
+    assert orbit.stable
+
+
+def test_period_is_found(classic):
+    """Without a guess of the period the solution is followed to where it settles."""
+    orbit = find_orbit(gallery.StickSlip(), Motion(1.5, 0.0), **METHOD)
+    np.testing.assert_allclose(orbit.period, classic.period, atol=1e-10)
+
+
+def test_solution_over_several_periods(classic):
+    sol = classic.solve(periods=2)
+    np.testing.assert_allclose([sol.y1.x, sol.y1.v], [classic.y0.x, classic.y0.v], atol=1e-9)
+    assert len(sol.events) == 4
+    middle = sol(classic.period)
+    np.testing.assert_allclose([middle.x, middle.v], [classic.y0.x, classic.y0.v], atol=1e-9)
+
+
+# What may go wrong: pitfall 26.
+
+
+@pytest.mark.parametrize(
+    "parameters, y0, period, result",
+    [
+        (dict(c=0.1), (1.0, 1e-3), 6.3, RESULTS.orbit_is_equilibrium),  # a focus at x = F_slip / k
+        (dict(c=0.1), (2.0, 0.0), 2 * 12.6352, RESULTS.orbit_is_multiple_cover),
+        (dict(), (2.02, 0.0), 3 * 13.536, RESULTS.orbit_is_multiple_cover),
+        (dict(c=0.1, v_dr=2.0), (2.0, 0.0), 12.6, RESULTS.orbit_is_equilibrium),  # beyond the fold of Fig. 6.15
+    ],
+)
+def test_not_the_orbit_asked_for(parameters, y0, period, result):
+    system = gallery.StickSlip(**parameters)
+    orbit = find_orbit(system, Motion(*y0), period=period, throw=False, **METHOD)
+    assert orbit.result == result
+    with pytest.raises(eqx.EquinoxRuntimeError, match=str(RESULTS[result])[:30]):
+        find_orbit(system, Motion(*y0), period=period, **METHOD)
+
+
+class Hopf(nsjax.System):
+    """r' = r (μ - r²) + drift, θ' = w in Cartesian coordinates: the orbit r = √μ, multipliers 1 and exp(-2 μ T)."""
+
+    mu: float = 0.5
+    w: float = 2.0
+    drift: float = 0.0
+
+    def vector_field(self, t, y, s):
+        rise = self.mu - y.x**2 - y.y**2
+        return Plane(y.x * rise - self.w * y.y + self.drift, y.y * rise + self.w * y.x)
+
+
+class Resonator(nsjax.System):
+    """x'' + c x' + k x = f_0 cos ωt."""
+
+    c: float = 0.2
+    k: float = 1.0
+    f_0: float = 1.0
+    omega: float = 0.7
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, self.f_0 * jnp.cos(self.omega * t) - self.c * y.v - self.k * y.x)
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+def test_no_orbit_at_all():
+    """Nothing returns: x only grows."""
+    with pytest.raises(eqx.EquinoxRuntimeError, match="No periodic orbit was found"):
+        find_orbit(Hopf(drift=50.0, mu=-1.0), Plane(1.0, 0.0), period=3.0, **METHOD)
+
+
+def test_smooth_autonomous_orbit_and_its_derivatives():
+    """Period 2 π / w and r = √μ; derivatives of the period, the state and the multipliers by parameters."""
+
+    @jax.jit
+    def orbit(p):
+        o = find_orbit(Hopf(mu=p[0], w=p[1]), Plane(0.9, 0.1), period=3.0, throw=False, **METHOD)
+        return jnp.stack([o.period, jnp.hypot(*o.y0), jnp.min(jnp.abs(o.multipliers))]), o.result
+
+    p = jnp.asarray([0.5, 2.0])
+    derivative, result = jax.jit(jax.jacfwd(orbit, has_aux=True))(p)
+    value, _ = orbit(p)
+    assert result == RESULTS.successful
+    T, small = np.pi, np.exp(-np.pi)
+    np.testing.assert_allclose(value, [T, np.sqrt(0.5), small], rtol=1e-10)
+    np.testing.assert_allclose(
+        derivative, [[0, -T / 2], [0.5 / np.sqrt(0.5), 0], [-2 * T * small, T / 2 * small]], atol=1e-8
+    )
+
+
+def test_forced_orbit_and_its_derivative():
+    def exact(c, k, omega):
+        amplitude = 1 / (k - omega**2 + 1j * c * omega)
+        return jnp.stack([amplitude.real, (1j * omega * amplitude).real])
+
+    def orbit(p):
+        o = find_orbit(Resonator(c=p[0], k=p[1], omega=p[2]), Motion(0.0, 0.0), throw=False, **METHOD)
+        return jnp.stack(o.y0), (jnp.stack(o.y0), o.result)
+
+    p = jnp.asarray([0.2, 1.0, 0.7])
+    derivative, (y0, result) = jax.jit(jax.jacfwd(orbit, has_aux=True))(p)
+    assert result == RESULTS.successful
+    np.testing.assert_allclose(y0, exact(*p), atol=1e-10)
+    np.testing.assert_allclose(derivative, jnp.stack(jax.jacfwd(exact, (0, 1, 2))(*p), -1), atol=1e-8)
+
+
+@pytest.mark.slow
+def test_derivative_of_the_stick_slip_period():
+    """T = 2 / v + π + 2 atan v."""
+
+    def period(v):
+        return find_orbit(gallery.StickSlip(v_dr=v), Motion(2.02, 0.0), period=13.54, throw=False, **METHOD).period
+
+    for v in (0.2, 0.3):
+        found = jax.jit(jax.jacfwd(period))(jnp.asarray(v))
+        np.testing.assert_allclose(found, -2 / v**2 + 2 / (1 + v**2), rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_many_orbits_at_once():
+    """Pitfall 17: a sweep over the belt's velocity, with one lane that has no orbit."""
+    v = jnp.asarray([0.15, 0.2, 0.4, jnp.nan, 0.8])
+
+    @jax.jit
+    @jax.vmap
+    def sweep(v):
+        o = find_orbit(gallery.StickSlip(v_dr=v), Motion(2.02, 0.0), period=reference_period(v), throw=False, **METHOD)
+        return o.period, o.multipliers, o.result, o.stable
+
+    period, multipliers, result, stable = sweep(v)
+    good = np.isfinite(v)
+    np.testing.assert_allclose(period[good], reference.stick_slip_period(np.asarray(v))[good], atol=1e-9)
+    np.testing.assert_allclose(multipliers[good], np.tile([1, 0], (4, 1)), atol=1e-9)
+    assert np.all((result == RESULTS.successful) == good) and np.all(stable[good])
+
+
+def reference_period(v):
+    return 2 / v + jnp.pi
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(order=0), "`order` must be a positive integer"),
+        (dict(order=2), "`order` must be 1 for an autonomous system"),
+        (dict(period=-1.0), "`period` must be positive"),
+        (dict(max_steps=0), "`max_steps` must be a positive integer"),
+    ],
+)
+def test_wrong_arguments(change, message):
+    with pytest.raises(ValueError, match=message):
+        find_orbit(gallery.StickSlip(), Motion(2.0, 0.0), **(dict(period=13.5) | METHOD | change))
+
+
+def test_a_period_is_not_given_to_a_forced_system():
+    with pytest.raises(ValueError, match="use `order` for a subharmonic"):
+        find_orbit(Resonator(), Motion(0.0, 0.0), period=9.0)
