@@ -50,7 +50,8 @@ class Orbit(eqx.Module):
     stable: Bool[Array, ""]
     residual: Scalar
     result: RESULTS
-    method: dict[str, Any]  # solver, stepsize_controller, max_steps, max_events
+    # solver, stepsize_controller, max_steps, max_events: static, so that orbits come out of `vmap`
+    method: tuple[tuple[str, Any], ...] = eqx.field(static=True)
 
     @property
     def itinerary(self) -> tuple[dict[str, int], ...]:
@@ -63,10 +64,10 @@ class Orbit(eqx.Module):
         """The solution over one or several periods from the base point; further arguments as for `nsjax.solve`."""
         end = self.t0 + periods * self.period
         mode = tuple(self.mode) if self.events.names else None
-        return solve(self.system, self.t0, end, self.y0, mode=mode, saveat=saveat, **(self.method | kwargs))
+        return solve(self.system, self.t0, end, self.y0, mode=mode, saveat=saveat, **(dict(self.method) | kwargs))
 
     def __str__(self) -> str:
-        state = ", ".join(f"{x:.12g}" for x in jfu.ravel_pytree(self.y0)[0])
+        state = ", ".join(f"{x:.12g}" for x in _flat(self.y0))
         modes = " -> ".join(", ".join(f"{n} {m:+d}" for n, m in row.items()) for row in self.itinerary)
         multipliers = ", ".join(f"{complex(m):.6g}" for m in self.multipliers)
         return (
@@ -83,18 +84,35 @@ def _distance(a: Array, b: Array) -> Array:
     return jnp.max(jnp.abs(a - b), axis=-1)
 
 
-def _base_point(system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any, method: dict) -> Y:
-    """A point of the trajectory in the middle of its longest arc between events, on a smooth one if there is any.
+def _flat(y: Y) -> Array:
+    return jfu.ravel_pytree(y)[0]
 
-    The flow map is only one-sided differentiable at an event, and the phase condition wants a transversal section.
+
+def _base_point(system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any, method: dict) -> tuple[Y, Scalar]:
+    """A better guess, from the solution over two and a half guessed periods.
+
+    The base point is in the middle of the longest arc between events, on a smooth one if there is any: the flow map is
+    only one-sided differentiable at an event, and the phase condition wants a transversal section. The period is the
+    time after which the solution comes nearest to it again, among those within half the guess of it.
     """
-    sol = solve(system, t0, t0 + period, y0, mode=mode, saveat=dfx.SaveAt(dense=True), throw=False, **method)
+    end_time = t0 + 2.5 * period
+    sol = solve(system, t0, end_time, y0, mode=mode, saveat=dfx.SaveAt(dense=True), throw=False, **method)
     begin, end, _, modes = arcs(sol, t0, y0)
+    begin, end = jnp.minimum(begin, t0 + period), jnp.minimum(end, t0 + period)
     slides = jnp.stack(
         [modes[:, k] == 0 for k, s in enumerate(system.switches) if isinstance(s, sgn)] or [jnp.zeros(len(begin), bool)]
     ).any(0)
     longest = jnp.argmax((end - begin) * jnp.where(slides, 1e-6, 1.0))
-    return sol.evaluate(0.5 * (begin[longest] + end[longest]))
+    base = 0.5 * (begin[longest] + end[longest])
+    here = sol.evaluate(base)
+    share = jnp.linspace(0.5, 1.5, 401, dtype=base.dtype)
+    later = jax.vmap(lambda u: _flat(sol.evaluate(base + u * period)))(share)
+    extent = jnp.max(later, axis=0) - jnp.min(later, axis=0)
+    gap = _distance(later / jnp.where(extent == 0, 1, extent), _flat(here) / jnp.where(extent == 0, 1, extent))
+    # Of equally near returns the one nearest to the guess: a user who asks for two laps gets two.
+    best = share[jnp.argmin(gap + 0.05 * jnp.abs(share - 1))]
+    reached = sol.result == RESULTS.successful
+    return here, jnp.where(reached, best, 1) * period
 
 
 @eqx.filter_jit
@@ -114,8 +132,8 @@ def _shoot(
     still = frozen(system)
     model = Model(still, jnp.ones_like(t0), t0, y0)
     guess = lax.stop_gradient(y0)
-    if autonomous and model.slots:
-        guess = lax.stop_gradient(_base_point(still, t0, guess, lax.stop_gradient(period), mode, method))
+    if autonomous:
+        guess, period = lax.stop_gradient(_base_point(still, t0, guess, lax.stop_gradient(period), mode, method))
         mode = None
     flat, unravel = jfu.ravel_pytree(guess)
     forcing = None if autonomous else jnp.asarray(system.period, t0.dtype) * order
@@ -124,12 +142,12 @@ def _shoot(
         sol = solve(system, t0, t0 + period, unravel(x), mode=mode, throw=False, **method)
         # A solution that ended early is no solution: Newton's method must not be led by it.
         ok = sol.result == RESULTS.successful
-        return jnp.where(ok, jfu.ravel_pytree(sol.y1)[0], jnp.nan)
+        return jnp.where(ok, _flat(sol.y1), jnp.nan)
 
     if autonomous:
         # Poincaré's phase condition: the base point stays on the section through the guess.
         start = _at_start(model, t0, guess)
-        normal = jfu.ravel_pytree(model.flow(t0, guess, start))[0]
+        normal = _flat(model.flow(t0, guess, start))
         speed = normal @ normal
 
         def residual(z: tuple, system: System) -> tuple:
@@ -168,9 +186,9 @@ def _shoot(
         system, t0, t0 + period, unravel(x), mode=mode, throw=False, **method,
         saveat=dfx.SaveAt(ts=t0 + period * jnp.asarray(fractions, t0.dtype), t1=True),
     )  # fmt: skip
-    points = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys)
+    points = jax.vmap(_flat)(sol.ys)
     away = _distance(points[:-1], x)
-    error = _distance(jfu.ravel_pytree(sol.y1)[0], x)
+    error = _distance(_flat(sol.y1), x)
     amplitude = jnp.max(away)
     size = 1 + jnp.max(jnp.abs(x))
     repeats = jnp.zeros((), bool)
@@ -204,7 +222,7 @@ def _shoot(
         stable=jnp.all(inside),
         residual=error,
         result=result,
-        method=method,
+        method=tuple(method.items()),
     )
 
 
@@ -241,8 +259,8 @@ def _settle(system: System, t0: Scalar, y0: Y, mode: Any, method: dict) -> tuple
     u = jnp.arange(8) / 8
     times = (starts[:, None] + (stops - starts)[:, None] * u).ravel()
     valid = jnp.repeat(jnp.arange(len(starts)) < steps, 8)
-    states = jax.vmap(lambda t: jfu.ravel_pytree(loop.evaluate(t))[0])(jnp.where(valid, times, t0))
-    here = jfu.ravel_pytree(last.y1)[0]
+    states = jax.vmap(lambda t: _flat(loop.evaluate(t)))(jnp.where(valid, times, t0))
+    here = _flat(last.y1)
     scale = jnp.max(jnp.where(valid[:, None], jnp.abs(states - here), 0), axis=0)
     gap = jnp.max(jnp.abs(states - here) / jnp.where(scale == 0, 1, scale), axis=-1)
     gap = jnp.where(valid, gap, jnp.inf)
