@@ -136,8 +136,11 @@ def _given(system: System, mode: Any) -> dict[str, Any]:
     return {n: jnp.asarray(v, jnp.int32) for n, v in mode.items()}
 
 
-def check_model(system: System, t: Scalar, y: Y, direction: Scalar) -> None:
-    """Checks the model where that needs no numbers: structure, shapes, and dependence on the switch values."""
+def check_model(system: System, t: Scalar, y: Y, direction: Scalar) -> Scalar:
+    """Checks the model where that needs no numbers: structure, shapes, and dependence on the switch values.
+
+    **Returns:** the time `t`, to be used so that errors found at run time are raised.
+    """
     name = type(system).__name__
     switches = system.switches
     names = [k.name for k in switches]
@@ -176,10 +179,13 @@ def check_model(system: System, t: Scalar, y: Y, direction: Scalar) -> None:
             _check_guard(name, f"{switch.name}.off", switch.off_guard, system, t, y)
             if isinstance(switch.guard(system, t, y), tuple) or isinstance(switch.off_guard(system, t, y), tuple):
                 raise ValueError(f"`{name}.{switch.name}` is a relay: its surfaces must be scalars, not tuples.")
-            eqx.error_if(t, direction < 0, f"`{name}.{switch.name}` is a relay, whose memory cannot be run backwards.")
+            t = eqx.error_if(
+                t, direction < 0, f"`{name}.{switch.name}` is a relay, whose memory cannot be run backwards."
+            )
         else:
             assert isinstance(switch, impact)
             _check_impact(name, k, switch, system, t, y, field, zeros)
+    return t
 
 
 def _check_guard(owner: str, name: str, guard: Any, system: System, t: Scalar, y: Y) -> None:

@@ -263,13 +263,15 @@ def _rebounded(
     pull = _derivative(model, rate, te, after, state_after)
     h = jnp.stack(model.h(k, te, after))
     noise = model.rounding(lambda t, y: model.h(k, t, y), te, after)
-    slack = jnp.abs(jnp.stack(model.h(k, te, before)))
-    wrong = fired & (jnp.any(h < -1e4 * noise - 2 * slack) | (rise < -1e-9 * jnp.abs(speed)))
+    slack = 1e4 * noise + 2 * jnp.abs(jnp.stack(model.h(k, te, before)))
+    part = 0 if state_after.part[k] is None else state_after.part[k]
+    stays = jnp.abs(h[part]) <= slack[part]  # on its surface: a reset of the user's own may carry the state off it
+    wrong = fired & (jnp.any(h < -slack) | (stays & (rise < -1e-9 * jnp.abs(speed))))
 
     ratio = jnp.where(speed == 0, 0, -rise / jnp.where(speed == 0, 1, speed))
     flight = 2 * rise / -pull
     short = flight <= jnp.sqrt(jnp.finfo(te.dtype).eps) * (te - t_start)
-    ends = fired & ~wrong & (pull < 0) & (ratio < 1) & short
+    ends = fired & stays & ~wrong & (pull < 0) & (ratio < 1) & short
     rest = jnp.where(ends, flight / (1 - ratio), 0)
     drift = jax.tree.map(lambda x, f: x + rest * f, after, model.flow(te, after, state_after))
     impulse = jax.tree.map(jnp.subtract, after, before)
@@ -278,5 +280,5 @@ def _rebounded(
     settled = jax.tree.map(lambda x, d: x - scale * d, drift, impulse)
     after = jax.tree.map(lambda a, b: jnp.where(ends, a, b), settled, after)
     simple = rise > 0
-    roots = jnp.where(fired, jnp.where(simple, 1, 2), roots).astype(jnp.int32)
+    roots = jnp.where(fired, jnp.where(stays, jnp.where(simple, 1, 2), 0), roots).astype(jnp.int32)
     return t_after + rest, after, roots, jnp.where(wrong, 1, jnp.where(ends, 2, 0))

@@ -136,6 +136,7 @@ def _shoot(
         guess, period = lax.stop_gradient(_base_point(still, t0, guess, lax.stop_gradient(period), mode, method))
         mode = None
     flat, unravel = jfu.ravel_pytree(guess)
+    first_period = lax.stop_gradient(period)
     forcing = None if autonomous else jnp.asarray(system.period, t0.dtype) * order
 
     def flow(system: System, x: Array, period: Scalar) -> Array:
@@ -191,6 +192,10 @@ def _shoot(
     error = _distance(_flat(sol.y1), x)
     amplitude = jnp.max(away)
     size = 1 + jnp.max(jnp.abs(x))
+    if autonomous:
+        # Where Newton's method ends near an equilibrium, its Jacobian is singular and it seldom says that it converged.
+        last = _flat(model.flow(t0, unravel(x), _at_start(model, t0, unravel(x))))
+        at_rest = at_rest | (jnp.max(jnp.abs(last)) * first_period <= 1e-6 * size)
     repeats = jnp.zeros((), bool)
     for p in primes:
         repeats = repeats | (away[int(np.argmin(np.abs(fractions - 1 / p)))] <= 1e-6 * amplitude)
@@ -242,23 +247,27 @@ def _at_start(model: Model, t: Scalar, y: Y) -> Any:
 
 
 @eqx.filter_jit
-def _settle(system: System, t0: Scalar, y0: Y, mode: Any, method: dict) -> tuple[Y, Scalar]:
-    """Follows the solution to where it settles; for an autonomous system also the time in which it returns there.
+def _settle(system: System, t0: Scalar, y0: Y, mode: Any, method: dict) -> tuple[Y, Scalar, Bool[Array, ""]]:
+    """Follows the solution to where it settles; for an autonomous system also the time in which it returns there (0 if
+    it does not), and whether it comes to rest.
 
     How long that takes is measured in steps of the integration, which know the system's own scale of time.
     """
     if system.period is not None:
         end = t0 + 100 * jnp.asarray(system.period, t0.dtype)
-        return solve(system, t0, end, y0, mode=mode, throw=False, **method).y1, end - t0
-    big = method | {"max_steps": 2000, "max_events": 1000}
+        return solve(system, t0, end, y0, mode=mode, throw=False, **method).y1, end - t0, jnp.zeros((), bool)
+    # Only a guess is wanted: a loose tolerance makes long steps, and so the solution is followed farther.
+    loose = 1e-6 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4
+    controller = dfx.PIDController(rtol=loose, atol=loose)
+    big = dict(solver=method["solver"], stepsize_controller=controller, max_steps=2000, max_events=1000)
     last = solve(system, t0, t0 + 1e9, y0, mode=mode, throw=False, **big)
     given = tuple(last.mode1) if system.switches else None
     loop = solve(system, t0, t0 + 1e9, last.y1, mode=given, saveat=dfx.SaveAt(dense=True), throw=False, **big)
     starts, stops, points, _, steps = loop.dense
     # Eight points a step: the polynomial between control points bends little.
-    u = jnp.arange(8) / 8
+    u = jnp.asarray(np.arange(8) / 8, starts.dtype)
     times = (starts[:, None] + (stops - starts)[:, None] * u).ravel()
-    valid = jnp.repeat(jnp.arange(len(starts)) < steps, 8)
+    valid = jnp.repeat(jnp.arange(len(starts), dtype=steps.dtype) < steps, 8)
     states = jax.vmap(lambda t: _flat(loop.evaluate(t)))(jnp.where(valid, times, t0))
     here = _flat(last.y1)
     scale = jnp.max(jnp.where(valid[:, None], jnp.abs(states - here), 0), axis=0)
@@ -268,7 +277,8 @@ def _settle(system: System, t0: Scalar, y0: Y, mode: Any, method: dict) -> tuple
     far = jnp.cumsum(gap > 0.3) > 0
     near = far & (gap < 0.1)
     low = near & (gap <= jnp.roll(gap, 1)) & (gap <= jnp.roll(gap, -1))
-    return last.y1, times[jnp.argmax(low)] - t0
+    rests = (last.result == RESULTS.max_steps_reached) & (jnp.max(scale) <= 1e-4 * (1 + jnp.max(jnp.abs(here))))
+    return last.y1, jnp.where(rests, 0, times[jnp.argmax(low)] - t0), rests
 
 
 def find_orbit(
@@ -334,16 +344,21 @@ def find_orbit(
     kwargs = dict(order=order, mode=given, method=method, tol=tol, max_iterations=max_iterations)
     settled = autonomous and period is None
     if settled:
-        y0, period = _settle(frozen(system), t0, lax.stop_gradient(y0), given, method)
+        y0, period, rests = _settle(frozen(system), t0, lax.stop_gradient(y0), given, method)
         kwargs["mode"] = None
+        lost = ~(period > 0)
+        period = jnp.where(lost, 1, period)
     period = jnp.asarray(1.0 if period is None else period, t0.dtype)
     if concrete and autonomous and not period > 0:
-        if settled:
-            raise RuntimeError(str(RESULTS[RESULTS.orbit_is_equilibrium]))
         raise ValueError(f"Argument `period` must be positive, but got {period}.")
     orbit = _shoot(system, t0, y0, period, **kwargs)
-    if concrete and not settled and bool(orbit.result != RESULTS.successful):
-        y1, period = _settle(system, t0, y0, given, method)
+    if settled:
+        end = RESULTS.where(rests, RESULTS.orbit_is_equilibrium, RESULTS.orbit_not_found)
+        orbit = eqx.tree_at(lambda o: o.result, orbit, RESULTS.where(lost, end, orbit.result))
+    elif concrete and bool((orbit.result != RESULTS.successful) & (orbit.result != RESULTS.orbit_is_multiple_cover)):
+        y1, period, rests = _settle(system, t0, y0, given, method)
+        if rests:
+            orbit = eqx.tree_at(lambda o: o.result, orbit, RESULTS.orbit_is_equilibrium)
         if period > 0:
             second = _shoot(system, t0, y1, period, **(kwargs | {"mode": None}))
             orbit = second if bool(second.result == RESULTS.successful) else orbit

@@ -374,7 +374,7 @@ def _run(
     meter: dfx.AbstractProgressMeter,
 ) -> Solution:
     direction = jnp.where(t1 >= t0, 1, -1).astype(t0.dtype)
-    check_model(system, t0, y0, direction)
+    t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
     model = Model(system, direction, start, y0)
     stepper = Stepper(solver)

@@ -86,7 +86,7 @@ def arcs(sol: Solution, t0: Scalar, y0: Y) -> tuple[Array, Array, Y, Array]:
     event have no length."""
     events = sol.events
     capacity = events.t.shape[0]
-    happened = jnp.arange(capacity) < events.num
+    happened = jnp.arange(capacity, dtype=events.num.dtype) < events.num
 
     def rows(first: Any, later: Any, end: Any) -> Any:
         def leaf(a: Array, b: Array, c: Array) -> Array:
@@ -144,7 +144,7 @@ def _by_arcs(
     begin, end, state, modes = arcs(sol, t0, y0)
     jumps = eye[None]
     if sol.events.t.size:
-        happened = jnp.arange(sol.events.t.size) < sol.events.num
+        happened = jnp.arange(sol.events.t.size, dtype=sol.events.num.dtype) < sol.events.num
         later = jnp.where(happened[:, None, None], saltation_matrices(system, sol.events), eye)
         jumps = jnp.concatenate([jumps, later])
 
