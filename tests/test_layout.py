@@ -69,10 +69,11 @@ def test_importing_is_light_and_changes_nothing():
     code = (
         "import sys, jax\n"
         "before = dict(jax.config.values)\n"
-        "import nsjax, nsjax.__main__\n"
+        "import nsjax\n"
+        "assert nsjax.plot and nsjax.gallery\n"
+        "import nsjax.__main__\n"
         "assert dict(jax.config.values) == before\n"
         "assert 'matplotlib' not in sys.modules\n"
-        "assert nsjax.plot and nsjax.gallery\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=PACKAGE.parent, capture_output=True, text=True)
     assert not done.returncode, done.stderr

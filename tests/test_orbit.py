@@ -53,7 +53,9 @@ def check_stick_slip(orbit, exact, **parameters):
     names = {0: "stick", -1: "slip"}
     assert [names[e.mode_after["belt"]] for e in orbit.events] == [e[1] for e in exact.events]
     np.testing.assert_allclose(
-        spans([float(e.t) for e in orbit.events], exact.period), spans([e[0] for e in exact.events], exact.period), atol=1e-10
+        spans([float(e.t) for e in orbit.events], exact.period),
+        spans([e[0] for e in exact.events], exact.period),
+        atol=1e-10,
     )
     for e, (_, _, x, v) in zip(orbit.events, exact.events):
         np.testing.assert_allclose([e.y_after.x, e.y_after.v], [x, v], atol=1e-10)
@@ -88,7 +90,9 @@ def test_section_3_5():
     assert [names[e.mode_after["support"]] for e in orbit.events] == [e[1] for e in exact.events]
     np.testing.assert_allclose([float(e.t) for e in orbit.events], [e[0] for e in exact.events], atol=1e-10)
     np.testing.assert_allclose(orbit.monodromy, exact.monodromy, atol=1e-9)
-    np.testing.assert_allclose(np.sort_complex(np.asarray(orbit.multipliers)), np.sort_complex(exact.multipliers), atol=1e-9)
+    np.testing.assert_allclose(
+        np.sort_complex(np.asarray(orbit.multipliers)), np.sort_complex(exact.multipliers), atol=1e-9
+    )
     np.testing.assert_allclose(by_autodiff(orbit, system), orbit.monodromy, atol=1e-8)
     assert orbit.stable
 
@@ -160,7 +164,10 @@ def test_no_orbit_at_all():
     """Nothing returns: x only grows."""
     with pytest.raises(eqx.EquinoxRuntimeError, match="No periodic orbit was found"):
         find_orbit(Hopf(rate=0.0, w=0.0, drift=1.0), Plane(1.0, 0.0), period=3.0, **METHOD)
-    assert find_orbit(Hopf(rate=0.0, w=0.0, drift=1.0), Plane(1.0, 0.0), throw=False, **METHOD).result == RESULTS.orbit_not_found
+    assert (
+        find_orbit(Hopf(rate=0.0, w=0.0, drift=1.0), Plane(1.0, 0.0), throw=False, **METHOD).result
+        == RESULTS.orbit_not_found
+    )
 
 
 def test_smooth_autonomous_orbit_and_its_derivatives():

@@ -1,0 +1,125 @@
+"""Nothing for nothing: a model pays only for what it contains, read off its jaxpr."""
+
+import collections
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import pytest
+from jax.extend.core import ClosedJaxpr, Jaxpr
+from models import Motion
+
+import nsjax
+from nsjax import solve
+from nsjax._filippov import Model
+
+
+class Free(nsjax.System):
+    """x'' = -x."""
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x)
+
+
+class Crossing(nsjax.System):
+    """x'' = -x - sgn(x): its value does not act on x', so that nothing can slide."""
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - s.side)
+
+    @nsjax.sgn
+    def side(self, t, y):
+        return y.x
+
+
+class Rubbing(nsjax.System):
+    """x'' = -x - sgn(v): it may stick."""
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - s.rub)
+
+    @nsjax.sgn
+    def rub(self, t, y):
+        return y.v
+
+
+class Bent(Rubbing):
+    """The same, with a surface that is not affine."""
+
+    @nsjax.sgn
+    def rub(self, t, y):
+        return jnp.sin(y.v)
+
+
+class Idle(nsjax.System):
+    """A switch by which nothing changes."""
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x)
+
+    @nsjax.sgn
+    def side(self, t, y):
+        return y.x
+
+
+def count(jaxpr, into=None):
+    """How often each primitive occurs, in all nested jaxprs too."""
+    into = collections.Counter() if into is None else into
+    for eqn in jaxpr.eqns:
+        into[eqn.primitive.name] += 1
+        for value in jax.tree.leaves(eqn.params, is_leaf=lambda x: isinstance(x, (Jaxpr, ClosedJaxpr))):
+            if isinstance(value, ClosedJaxpr):
+                count(value.jaxpr, into)
+            elif isinstance(value, Jaxpr):
+                count(value, into)
+    return into
+
+
+def primitives(system, **kwargs):
+    kwargs = dict(solver=dfx.Heun(), stepsize_controller=dfx.ConstantStepSize(), dt0=0.1, throw=False) | kwargs
+    closed = jax.make_jaxpr(lambda y: solve(system, 0.0, 1.0, y, **kwargs).y1)(Motion(jnp.ones(()), jnp.ones(())))
+    return count(closed.jaxpr)
+
+
+def total(counter):
+    return sum(counter.values())
+
+
+@pytest.fixture(scope="module")
+def free():
+    return primitives(Free())
+
+
+def test_without_switches_no_event_code(free):
+    """One loop, no branch, no search for roots, no linear algebra."""
+    assert free["while"] == 1
+    for name in ("compact_cond", "cond", "scan", "lu", "sort", "argmax", "argmin", "top_k", "custom_linear_solve"):
+        assert free[name] == 0, name
+    one = primitives(Crossing())
+    assert one["compact_cond"] >= 1 and one["while"] > 1
+    print(total(free), total(one), total(primitives(Rubbing())))
+    assert total(free) < total(one) / 3
+
+
+def test_no_multiplier_where_nothing_slides():
+    t, y = jnp.zeros(()), Motion(jnp.ones(()), jnp.ones(()))
+
+    def slots(system):
+        return [(s.switch, s.sliding) for s in Model(system, jnp.ones(()), t, y).slots]
+
+    assert slots(Free()) == []
+    assert slots(Crossing()) == [(0, False)] == slots(Idle())
+    assert slots(Rubbing()) == [(0, False), (0, True), (0, True)]
+    assert total(primitives(Crossing())) < 0.8 * total(primitives(Rubbing()))
+
+
+def test_affine_surfaces_are_not_interpolated():
+    """Bernstein coefficients of an affine h are its values at the control points."""
+    affine, bent = primitives(Rubbing()), primitives(Bent())
+    print(total(affine), total(bent), affine["dot_general"], bent["dot_general"])
+    assert total(affine) < total(bent) and affine["sin"] < bent["sin"]
+
+
+def test_dense_output_costs_only_where_asked_for(free):
+    assert total(primitives(Free(), saveat=dfx.SaveAt(dense=True))) > total(free)
+    assert total(primitives(Free(), saveat=dfx.SaveAt(t0=True, t1=True))) < 1.2 * total(free)
