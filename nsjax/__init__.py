@@ -1,5 +1,6 @@
 """nsjax: differentiable piecewise-smooth dynamics in JAX."""
 
+from . import gallery as gallery, plot as plot
 from ._orbit import find_orbit as find_orbit, Orbit as Orbit
 from ._saltation import (
     saltation_matrices as saltation_matrices,

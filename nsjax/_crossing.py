@@ -116,7 +116,7 @@ def _polish(c: Float[Array, " coefficients"]) -> Scalar:
         low = jnp.where(value > 0, u, low)
         high = jnp.where(value > 0, high, u)
         newton = u - value / slope
-        inside = (newton >= low) & (newton <= high)
+        inside = (newton >= low) & (newton <= high) & (slope < 0)  # it is a root downwards
         step = jnp.abs(newton - u)
         # Every third step bisects, unless Newton has all but halted: a flat polynomial cannot stall the search.
         trusted = inside & ((count % 3 != 2) | (step < 1e-2))

@@ -68,51 +68,72 @@ START = Motion(1.0, 0.5)
 MODELS = {
     "unknown switch": (
         friction(lambda t, y, s: Motion(y.v, -s.blet)),
-        AttributeError, "`Model.vector_field` asks for `s.blet`, but the system has no switch of that name.*`belt`",
+        AttributeError,
+        "`Model.vector_field` asks for `s.blet`, but the system has no switch of that name.*`belt`",
     ),
     "not affine": (
-        friction(lambda t, y, s: Motion(y.v, -s.belt**2)),
-        ValueError, "`Model.vector_field` must be affine in `s.belt`.*Use it as a factor",
+        friction(lambda t, y, s: Motion(y.v, -(s.belt**2))),
+        ValueError,
+        "`Model.vector_field` must be affine in `s.belt`.*Use it as a factor",
     ),
     "inside a function": (
-        friction(lambda t, y, s: Motion(y.v, -jnp.tanh(s.belt))), ValueError, "must be affine in `s.belt`",
+        friction(lambda t, y, s: Motion(y.v, -jnp.tanh(s.belt))),
+        ValueError,
+        "must be affine in `s.belt`",
     ),
     "in a where": (
-        friction(lambda t, y, s: Motion(y.v, jnp.where(s.belt > 0, -y.v, s.belt))), ValueError, "must be affine|affine",
+        friction(lambda t, y, s: Motion(y.v, jnp.where(s.belt > 0, -y.v, s.belt))),
+        ValueError,
+        "must be affine|affine",
     ),
     "other structure": (
-        friction(lambda t, y, s: (y.v, -s.belt)), ValueError, "`Model.vector_field` must return the structure of the state",
+        friction(lambda t, y, s: (y.v, -s.belt)),
+        ValueError,
+        "`Model.vector_field` must return the structure of the state",
     ),
     "other shape": (
-        friction(lambda t, y, s: Motion(y.v, -s.belt * jnp.ones(2))), ValueError,
+        friction(lambda t, y, s: Motion(y.v, -s.belt * jnp.ones(2))),
+        ValueError,
         r"leaf `.v` is float64\[2\] where the state has float64\[\]",
     ),
     "other dtype": (
-        friction(lambda t, y, s: Motion(y.v.astype(jnp.float32), -s.belt)), ValueError,
+        friction(lambda t, y, s: Motion(y.v.astype(jnp.float32), -s.belt)),
+        ValueError,
         r"leaf `.x` is float32\[\] where the state has float64\[\]",
     ),
     "h is a vector": (
-        friction(guard=lambda t, y: jnp.stack([y.x, y.v])), ValueError, r"`Model.belt` must return a scalar.*float64\[2\]",
+        friction(guard=lambda t, y: jnp.stack([y.x, y.v])),
+        ValueError,
+        r"`Model.belt` must return a scalar.*float64\[2\]",
     ),
     "h is a boolean": (
-        friction(guard=lambda t, y: y.v > 0), ValueError, r"`Model.belt` must return a scalar of dtype float64.*bool\[\]",
+        friction(guard=lambda t, y: y.v > 0),
+        ValueError,
+        r"`Model.belt` must return a scalar of dtype float64.*bool\[\]",
     ),
     "h is a state": (friction(guard=lambda t, y: y), ValueError, "`Model.belt` must return a scalar"),
     "two of one name": (Twins(), ValueError, "`Twins.switches` must have different names, but `belt` occurs 2 times"),
     "no law of impact": (
-        wall(), ValueError, "`Model.wall` is an impact: give it either `@wall.reset`.*or `@wall.restitution`",
+        wall(),
+        ValueError,
+        "`Model.wall` is an impact: give it either `@wall.reset`.*or `@wall.restitution`",
     ),
     "two laws of impact": (
-        wall(restitution=lambda self: 0.5, reset=lambda self, t, y: y), ValueError, "give it either",
+        wall(restitution=lambda self: 0.5, reset=lambda self, t, y: y),
+        ValueError,
+        "give it either",
     ),
     "restitution without direction": (
         wall(lambda t, y, s: Motion(y.v, -jnp.ones_like(y.v)), restitution=lambda self: 0.5),
-        ValueError, r"`Model.wall.restitution` needs the direction of the impulse.*`\+ s.wall / m`",
+        ValueError,
+        r"`Model.wall.restitution` needs the direction of the impulse.*`\+ s.wall / m`",
     ),
     "reset of another structure": (
-        wall(reset=lambda self, t, y: (y.x, -y.v)), ValueError, "`Model.wall.reset` must return a state of the structure",
+        wall(reset=lambda self, t, y: (y.x, -y.v)),
+        ValueError,
+        "`Model.wall.reset` must return a state of the structure",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", MODELS)
@@ -151,30 +172,64 @@ def test_breakaway_is_a_number():
 
 STICK_SLIP = gallery.StickSlip()
 ARGUMENTS = {
-    "class": (dict(system=gallery.StickSlip), TypeError, r"instance of `nsjax.System`.*Call it: `solve\(Model\(\), ...\)`"),
+    "class": (
+        dict(system=gallery.StickSlip),
+        TypeError,
+        r"instance of `nsjax.System`.*Call it: `solve\(Model\(\), ...\)`",
+    ),
     "no system": (dict(system=lambda t, y: y), TypeError, "must be an instance of `nsjax.System`"),
     "empty": (dict(y0=()), ValueError, "`y0` must hold at least one number, but it is empty"),
     "integer": (dict(y0=Motion(1, 0.5)), TypeError, "has the integer 1; write 1.0"),
     "integers": (dict(y0=Motion(jnp.asarray(1), 0.5)), TypeError, "must be of floating point dtype.*int64"),
     "boolean": (dict(y0=Motion(True, 0.5)), TypeError, "`y0` must hold floating point numbers"),
     "complex": (dict(y0=Motion(1j, 0.5)), TypeError, "must be real.*real and imaginary part"),
-    "times": (dict(t1=jnp.asarray([1.0, 2.0])), ValueError, r"`t1` must be a scalar, but has shape \(2,\); use `jax.vmap`"),
+    "times": (
+        dict(t1=jnp.asarray([1.0, 2.0])),
+        ValueError,
+        r"`t1` must be a scalar, but has shape \(2,\); use `jax.vmap`",
+    ),
     "solver": (dict(solver=dfx.Tsit5), TypeError, r"`solver` must be a diffrax solver such as `diffrax.Tsit5\(\)`"),
-    "no Runge-Kutta solver": (dict(solver=dfx.LeapfrogMidpoint()), TypeError, "must be a diffrax Runge-Kutta solver.*Tsit5"),
-    "implicit-explicit solver": (dict(solver=dfx.KenCarp4()), TypeError, "must be a diffrax Runge-Kutta solver.*Kvaerno5"),
+    "no Runge-Kutta solver": (
+        dict(solver=dfx.LeapfrogMidpoint()),
+        TypeError,
+        "must be a diffrax Runge-Kutta solver.*Tsit5",
+    ),
+    "implicit-explicit solver": (
+        dict(solver=dfx.KenCarp4()),
+        TypeError,
+        "must be a diffrax Runge-Kutta solver.*Kvaerno5",
+    ),
     "controller": (dict(stepsize_controller=1e-8), TypeError, "must be a diffrax step size controller"),
     "max_steps": (dict(max_steps=None), ValueError, "`max_steps` must be a positive integer, but got None"),
     "max_events": (dict(max_events=-1), ValueError, "`max_events` must be a positive integer, but got -1"),
-    "subs": (dict(saveat=dfx.SaveAt(subs=[dfx.SubSaveAt(t1=True)])), ValueError, "`saveat` must be .*without nested `subs`"),
-    "solver_state": (dict(saveat=dfx.SaveAt(t1=True, solver_state=True)), ValueError, "must not ask for `solver_state`"),
-    "mode: name": (dict(mode={"blet": 1}), ValueError, "must name switches of the system, but got `blet`; they are: `belt`"),
+    "subs": (
+        dict(saveat=dfx.SaveAt(subs=[dfx.SubSaveAt(t1=True)])),
+        ValueError,
+        "`saveat` must be .*without nested `subs`",
+    ),
+    "solver_state": (
+        dict(saveat=dfx.SaveAt(t1=True, solver_state=True)),
+        ValueError,
+        "must not ask for `solver_state`",
+    ),
+    "mode: name": (
+        dict(mode={"blet": 1}),
+        ValueError,
+        "must name switches of the system, but got `blet`; they are: `belt`",
+    ),
     "mode: value": (dict(mode={"belt": 2}), ValueError, r"must give `belt` one of \(-1, 0, 1\), but got 2"),
     "mode: number": (dict(mode=[1, 0]), ValueError, "must have one value for each of the 1 switches"),
     "mode: relay": (
-        dict(system=Thermostat(), y0=Heat(20.0), mode={"heater": -1}), ValueError, r"must give `heater` one of \(0, 1\)",
+        dict(system=Thermostat(), y0=Heat(20.0), mode={"heater": -1}),
+        ValueError,
+        r"must give `heater` one of \(0, 1\)",
     ),
-    "mode: impact": (dict(system=Hammer(), mode={"wall": 0}), ValueError, "must not name `wall`: an impact surface has no"),
-}  # fmt: skip
+    "mode: impact": (
+        dict(system=Hammer(), mode={"wall": 0}),
+        ValueError,
+        "must not name `wall`: an impact surface has no",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", ARGUMENTS)

@@ -9,12 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import Array
 from models import Motion, pid
 from scipy.linalg import expm
 
 import nsjax
-from nsjax import fundamental_matrix, gallery, saltation_matrices, saltation_matrix, solve, transversality
+from nsjax import gallery, saltation_matrices, saltation_matrix, solve, transversality
 
 
 class Swell(nsjax.System):

@@ -89,7 +89,7 @@ def test_stiff_friction():
     run = dict(solver=dfx.Kvaerno5(), stepsize_controller=pid(1e-8))
     sol = solve(gallery.StickSlip(c=1e6, v_dr=-1e-7), 0.0, 5.0, Motion(1.0, 3.0), **run)
     assert sol.mode1[0] == 0 and sol.stats["num_steps"] < 200
-    np.testing.assert_allclose(times(sol), [1e-6 * np.log((3 + 2e-6) / 1.9e-6)], rtol=1e-5)
+    np.testing.assert_allclose(times(sol), [1e-6 * np.log((3 + 2e-6) / 1.9e-6)], rtol=5e-4)
 
 
 def test_single_precision():

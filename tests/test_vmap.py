@@ -138,7 +138,7 @@ def test_every_lane_has_its_own_result():
             p[5],
             Motion(p[3], p[4]),
             throw=False,
-            max_steps=200,
+            max_steps=1000,
             max_events=100,
             **CHEAP,
         )

@@ -21,7 +21,7 @@ def notes(cls: type) -> dict[str, Note]:
     for base in reversed(cls.__mro__):
         try:
             source = inspect.getsource(base)
-        except (OSError, TypeError):  # built in, or defined in a session
+        except (OSError, TypeError):  # built in, or typed at a prompt
             continue
         found |= {name: Note(meaning, unit or "") for name, meaning, unit in _FIELD.findall(source)}
     return found
