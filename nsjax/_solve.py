@@ -543,6 +543,13 @@ def solve(
         system, t0, t1, y0, mode, solver, stepsize_controller, saveat, max_steps, max_events
     )
     system = arrays_of(system, t0.dtype)
+    # Tolerances are numbers too: a new one is no new program.
+    plain = [n for n in ("rtol", "atol") if isinstance(getattr(controller, n, None), (int, float))]
+    controller = eqx.tree_at(
+        lambda c: [getattr(c, n) for n in plain],
+        controller,
+        [jnp.asarray(getattr(controller, n), t0.dtype) for n in plain],
+    )
     if dt0 is not None:
         dt0 = jnp.abs(jnp.asarray(dt0, t0.dtype))
     return _run(

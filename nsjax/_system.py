@@ -221,7 +221,10 @@ def arrays_of(system: System, dtype: Any) -> System:
         return field.type in (float, "float")
 
     def convert(x: Any) -> Any:
-        return jnp.asarray(x, dtype) if isinstance(x, float) else x
+        if isinstance(x, float):
+            return jnp.asarray(x, dtype)
+        # A weakly typed array, such as `jnp.asarray(0.2)`, would be one more program to compile.
+        return jnp.asarray(x, x.dtype) if isinstance(x, jax.Array) else x
 
     for field in dataclasses.fields(system):
         value = getattr(system, field.name)

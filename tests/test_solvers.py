@@ -13,15 +13,15 @@ import nsjax
 from nsjax import gallery, RESULTS, saltation_matrix, solve
 
 
-EXPLICIT = [dfx.Euler, dfx.Heun, dfx.Midpoint, dfx.Ralston, dfx.Bosh3, dfx.Tsit5, dfx.Dopri5, dfx.Dopri8]
-IMPLICIT = [dfx.ImplicitEuler, dfx.Kvaerno3, dfx.Kvaerno4, dfx.Kvaerno5]
+DEFAULT = [dfx.Euler, dfx.Heun, dfx.Bosh3, dfx.Tsit5, dfx.Dopri8, dfx.ImplicitEuler, dfx.Kvaerno5]
+OTHERS = [dfx.Midpoint, dfx.Ralston, dfx.Dopri5, dfx.Kvaerno3, dfx.Kvaerno4]
 
 
 def final(v_dr=0.5, t1=30.0):
     return reference.stick_slip_final(np.array([v_dr]), t1)[0]
 
 
-@pytest.mark.parametrize("solver", EXPLICIT + IMPLICIT)
+@pytest.mark.parametrize("solver", DEFAULT + [pytest.param(s, marks=pytest.mark.slow) for s in OTHERS])
 def test_every_runge_kutta_solver(solver):
     """Seven events of section 3.4; pitfalls 5, 11 (coarse steps are rejected that saw an event)."""
     first_order = solver in (dfx.Euler, dfx.ImplicitEuler)
@@ -39,7 +39,10 @@ def test_every_runge_kutta_solver(solver):
     assert error < (2e-2 if first_order else 2e-4)
 
 
-@pytest.mark.parametrize("solver, order", [(dfx.Tsit5(), 5), (dfx.Dopri5(), 5), (dfx.Dopri8(), 8)])
+@pytest.mark.parametrize(
+    "solver, order",
+    [(dfx.Tsit5(), 5), pytest.param(dfx.Dopri5(), 5, marks=pytest.mark.slow), (dfx.Dopri8(), 8)],
+)
 def test_order_through_events_with_constant_steps(solver, order):
     """The error falls with the order of the method although events lie anywhere within the steps (pitfall 9)."""
 
