@@ -43,10 +43,11 @@ def nsjax_lane(v_dr: jax.Array, *, tol: float, solver: diffrax.AbstractSolver) -
 
 
 def measure_nsjax(
-    tol: float, solver: diffrax.AbstractSolver, v_dr: np.ndarray, *, batch: int, repeats: int
+    tol: float, solver: diffrax.AbstractSolver, v_dr: np.ndarray, *, batch: int | None, repeats: int
 ) -> Measured:
     lanes = jnp.asarray(v_dr)
-    sweep = jax.jit(lambda v: jax.lax.map(ft.partial(nsjax_lane, tol=tol, solver=solver), v, batch_size=batch))
+    lane = ft.partial(nsjax_lane, tol=tol, solver=solver)
+    sweep = jax.jit(jax.vmap(lane) if batch is None else lambda v: jax.lax.map(lane, v, batch_size=batch))
     start = time.perf_counter()
     compiled = sweep.lower(lanes).compile()
     compile_seconds = time.perf_counter() - start
@@ -57,10 +58,9 @@ def measure_nsjax(
         seconds.append(time.perf_counter() - start)
     error = np.abs(np.stack(y1, axis=1) - reference.stick_slip_final(v_dr))
     assert events.min() >= 8 and events.max() <= 30
-    return Measured(
-        f"nsjax {type(solver).__name__}", tol, len(v_dr), statistics.median(seconds), compile_seconds,
-        float(error.max()), float(np.median(error)),
-    )  # fmt: skip
+    name = f"nsjax {type(solver).__name__}" + (f"/{batch}" if batch else "")
+    worst, median = float(error.max()), float(np.median(error))
+    return Measured(name, tol, len(v_dr), statistics.median(seconds), compile_seconds, worst, median)
 
 
 def table(rows: list[Measured]) -> str:
@@ -86,16 +86,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lanes", type=int, default=4096)
     parser.add_argument("--scipy-lanes", type=int, default=8, help="scipy runs so many; its time is scaled to all")
-    parser.add_argument("--batch", type=int, default=1024)
+    parser.add_argument("--batch", type=int, default=256, help="chunks for nsjax and diffrax")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", help="where to write the numbers as JSON")
     args = parser.parse_args()
     v_dr = belt_velocities(args.lanes)
     rows = []
     for tol in (1e-8, 1e-10, 1e-12):
-        for solver in (diffrax.Tsit5(), diffrax.Dopri8()):
-            rows.append(measure_nsjax(tol, solver, v_dr, batch=args.batch, repeats=args.repeats))
-        rows.append(measure("diffrax", tol, v_dr, repeats=args.repeats, batch_size=256))
+        for batch in (None, args.batch):
+            for solver in (diffrax.Tsit5(), diffrax.Dopri8()):
+                rows.append(measure_nsjax(tol, solver, v_dr, batch=batch, repeats=args.repeats))
+            rows.append(measure("diffrax", tol, v_dr, repeats=args.repeats, batch_size=batch))
     rows.append(measure("heyoka", 1e-10, v_dr, repeats=3))
     few = belt_velocities(args.scipy_lanes)
     scipy = measure("DOP853", 1e-10, few, repeats=1)

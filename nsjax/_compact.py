@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir, partial_eval as pe
 
 
-_GROUP = 32  # lanes worked on together
+_GROUP = 32  # lanes worked on together, at least; a kernel costs as much to start as for some hundred lanes
 
 
 compact_cond_p = jex.Primitive("compact_cond")
@@ -55,19 +55,21 @@ def _impl(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr) -> list[Any]:
 def _gathered(pred: Any, inputs: list, axes: list, default: list, branch: Callable[..., Any]) -> list[Any]:
     """Runs the branch for the lanes where `pred` holds, group by group."""
     lanes = pred.shape[0]
-    group = min(_GROUP, lanes)
+    group = min(max(_GROUP, lanes // 8), lanes)
+    # The lanes with work, in order, and then `lanes`, which is dropped.
+    rank = jnp.cumsum(pred.astype(jnp.int32))
+    total = rank[-1]
+    order = jnp.full(lanes + group, lanes, jnp.int32)
+    order = order.at[jnp.where(pred, rank - 1, lanes + group)].set(jnp.arange(lanes, dtype=jnp.int32), mode="drop")
 
     def work(carry: tuple) -> tuple:
-        pending, results = carry
-        # The first lanes that wait; where there are no more the index is `lanes`, which is dropped.
-        waits, place = lax.top_k(pending.astype(jnp.float32), group)
-        place = jnp.where(waits > 0, place, lanes)
+        start, results = carry
+        place = lax.dynamic_slice(order, (start,), (group,))
         part = [x if a is None else x.at[place].get(mode="clip") for x, a in zip(inputs, axes)]
         new = jax.vmap(branch, in_axes=tuple(axes))(*part)
-        results = [r.at[place].set(n, mode="drop") for r, n in zip(results, new)]
-        return pending.at[place].set(False, mode="drop"), results
+        return start + group, [r.at[place].set(n, mode="drop") for r, n in zip(results, new)]
 
-    return lax.while_loop(lambda carry: jnp.any(carry[0]), work, (pred, default))[1]
+    return lax.while_loop(lambda carry: carry[0] < total, work, (jnp.zeros((), jnp.int32), default))[1]
 
 
 def _batched_outputs(jaxpr: jex.ClosedJaxpr, batched: list[bool]) -> list[bool]:

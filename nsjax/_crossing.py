@@ -13,8 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Scalar
 
+from ._once import once
 
-UNROLLED = 5  # steps of Newton's method on a root before a loop takes over
+
+UNROLLED = 3  # steps of Halley's method on a root before a loop takes over
 DEPTH = 40  # bisections: closer roots than 2**-40 of a step are one
 
 
@@ -93,45 +95,47 @@ def _restrict(c: Float[Array, "parts coefficients"], a: Scalar, b: Scalar) -> Fl
     return left(head[..., ::-1], 1 - a / b)[..., ::-1]
 
 
-def _value(c: list[Array], u: Scalar) -> Array:
-    """The polynomial with Bernstein coefficients `c` at u."""
-    while len(c) > 1:
-        c = [a + u * (b - a) for a, b in zip(c[:-1], c[1:])]
-    return c[0]
-
-
 def _polish(c: Float[Array, " coefficients"]) -> Scalar:
-    """The one root on [0, 1] of a polynomial with c[0] > 0 >= c[-1]: Newton's method kept inside the bracket.
+    """The one root on [0, 1] of a polynomial with c[0] > 0 >= c[-1]: Halley's method kept inside the bracket.
 
     The first steps are unrolled, being all that most roots need; for the others a loop goes on.
     """
     n = c.shape[-1] - 1
-    values = [c[j] for j in range(n + 1)]
-    slopes = [n * (b - a) for a, b in zip(values[:-1], values[1:])]
+    differences = [c[j] for j in range(n + 1)]
+    powers = []
+    for j in range(n + 1):
+        powers.append(once(math.comb(n, j) * differences[0]))
+        differences = [b - a for a, b in zip(differences[:-1], differences[1:])]
     eps = jnp.finfo(c.dtype).eps
 
     def improve(state: tuple) -> tuple:
         low, high, u, done, count = state
-        value, slope = _value(values, u), _value(slopes, u)
+        value = slope = bend = jnp.zeros_like(u)  # with half the second derivative
+        for a in reversed(powers):
+            value, slope, bend = value * u + a, slope * u + value, bend * u + slope
         low = jnp.where(value > 0, u, low)
         high = jnp.where(value > 0, high, u)
-        newton = u - value / slope
-        inside = (newton >= low) & (newton <= high) & (slope < 0)  # it is a root downwards
-        step = jnp.abs(newton - u)
-        # Every third step bisects, unless Newton has all but halted: a flat polynomial cannot stall the search.
-        trusted = inside & ((count % 3 != 2) | (step < 1e-2))
+        newton = value / slope
+        ratio = newton * bend / slope  # of the curvature to the slope over the way that is left
+        step = newton / (1 - ratio)
+        guess = u - step
+        inside = (guess >= low) & (guess <= high) & (slope < 0)  # it is a root downwards
+        # Where the curvature rules (near a double root) Halley's steps are short without being good. Every third step
+        # bisects, unless Halley has all but halted: a flat polynomial cannot stall the search.
+        step, ratio = jnp.abs(step), jnp.abs(ratio)
+        trusted = inside & (ratio <= 0.5) & ((count % 3 != 2) | (step < 1e-2))
         exact = (value == 0) & (slope < 0)
-        new = jnp.where(done | exact, u, jnp.where(trusted, newton, 0.5 * (low + high)))
-        # Newton's method squares the error: after a short step of its own what is left is rounding.
-        done = done | exact | (trusted & (step <= jnp.sqrt(eps))) | (high - low <= 4 * eps)
-        return low, high, new, done, count + 1
+        new = jnp.where(done | exact, u, jnp.where(trusted, guess, 0.5 * (low + high)))
+        # The error that is left is the step times the square of the ratio.
+        done = done | exact | (trusted & (ratio * ratio * step <= eps)) | (high - low <= 4 * eps)
+        return low, high, once(new), done, count + 1
 
     def busy(state: tuple) -> Bool[Array, ""]:
         *_, done, count = state
         return ~done & (count < 100)
 
     # A root at the very end is no place to start: an earlier one may be meant.
-    guess = jnp.where(c[-1] < 0, jnp.clip(c[0] / (c[0] - c[-1]), 0.0, 1.0), 0.5)
+    guess = once(jnp.where(c[-1] < 0, jnp.clip(c[0] / (c[0] - c[-1]), 0.0, 1.0), 0.5))
     state = (jnp.zeros_like(guess), jnp.ones_like(guess), guess, jnp.zeros((), bool), jnp.zeros((), jnp.int32))
     for _ in range(UNROLLED):
         state = improve(state)

@@ -21,11 +21,13 @@ from ._compact import compact_cond
 from ._crossing import deflate, elevate, nodes, to_bernstein, to_chebyshev
 from ._event import land, Landing
 from ._filippov import Model, State
+from ._once import once
 from ._save import Log, Saved
 from ._solution import Events, RESULTS, Solution
+from ._start import start_mode
 from ._step import stack, Stepper
 from ._structure import is_affine
-from ._system import arrays_of, impact, relay, System
+from ._system import arrays_of, System
 from ._types import Scalar, Y
 
 
@@ -48,73 +50,6 @@ class _Carry(eqx.Module):
     log: Log | None
     saved: Saved
     meter: PyTree
-
-
-def _start(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[State, RESULTS]:
-    """The mode in which the solution sets out: from the signs of h, from `mode=`, and on a surface by the fields."""
-    modes, parts, roots, at = [], [], [], {}
-    result = RESULTS.successful
-    on = {}
-    for k, switch in enumerate(model.switches):
-        zero = jnp.zeros((), jnp.int32)
-        if isinstance(switch, relay):
-            up = switch.guard(model.system, t * model.direction, y) > 0
-            down = switch.off_guard(model.system, t * model.direction, y) > 0
-            held = jnp.asarray(given.get(switch.name, 0), jnp.int32)
-            modes.append(jnp.where(up & ~down, 1, jnp.where(down, 0, held)).astype(jnp.int32))
-            parts.append(None)
-            roots.append(zero)
-            continue
-        h = jnp.stack(model.h(k, t, y))
-        noise = model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y)
-        part = jnp.argmin(h)
-        h, noise = h[part], noise[part]
-        on[k] = jnp.abs(h) <= noise
-        parts.append(part.astype(jnp.int32) if model.parts[k] > 1 else None)
-        roots.append(zero)
-        if isinstance(switch, impact):
-            modes.append(zero)
-            result = RESULTS.where(h < -noise, RESULTS.wrong_mode, result)
-        elif switch.name in given:
-            mode = jnp.asarray(given[switch.name], jnp.int32)
-            # A state taken from an earlier solution may carry some drift off its surface.
-            off = jnp.where(mode == 0, jnp.abs(h) > 1e6 * noise, mode.astype(h.dtype) * h < -1e6 * noise)
-            result = RESULTS.where(off, RESULTS.wrong_mode, result)
-            modes.append(mode)
-            at[k] = jnp.zeros((), bool)
-            on[k] = mode.astype(h.dtype) * h <= noise
-        else:
-            modes.append(jnp.where(on[k], 0, jnp.sign(h)).astype(jnp.int32))
-            at[k] = on[k]
-    state = State(tuple(modes), tuple(parts), tuple(roots))
-    state, unsure, wrong = model.settle(t, y, state, at, {k: jnp.zeros((), jnp.int32) for k in at})
-    result = RESULTS.where(unsure, RESULTS.repulsive_sliding, result)
-    result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
-    # Guards of surfaces on which the start lies have a root there already.
-    roots = list(state.roots)
-    s = model.values(t, y, state)
-    for k, here in on.items():
-        rate = model._rates((k,), t, y, state, s)[0]
-        sign = jnp.where(jnp.asarray(isinstance(model.switches[k], impact)), 1, state.mode[k])
-        scale = jnp.sqrt(jnp.finfo(t.dtype).eps) * _size(model, k, t, y, state, s)
-        fresh = jnp.where(jnp.abs(rate) > scale, 1, 2)
-        settled = at.get(k, jnp.zeros((), bool))
-        roots[k] = jnp.where(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
-    return state._replace(roots=tuple(roots)), result
-
-
-def _size(model: Model, k: int, t: Scalar, y: Y, state: State, s: tuple) -> Scalar:
-    """The largest that dh/dt could be for the components of the field: what its rounding is measured by."""
-    f = model.field(t, y, s)
-    total = jnp.zeros((), t.dtype)
-    for i in range(len(jax.tree.leaves(f))):
-        only = jax.tree.unflatten(
-            jax.tree.structure(f),
-            [x if i == j else jnp.zeros_like(x) for j, x in enumerate(jax.tree.leaves(f))],
-        )
-        part = jax.jvp(lambda y: jnp.min(jnp.stack(model.h(k, t, y))), (y,), (only,))[1]
-        total = total + jnp.abs(part)
-    return total
 
 
 class _Flow(eqx.Module):
@@ -294,11 +229,11 @@ class _Flow(eqx.Module):
         if model.slots:
             full = (events >= self.max_events) & ~done & (result == RESULTS.successful)
             result = RESULTS.where(full, RESULTS.max_events_reached, result)
-        bad = ~jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((y, f))]).all()
+        bad = ~_finite((y, f))
         result = RESULTS.where(bad, RESULTS.nonfinite_field, result)
         # Rejected again and again, down to nothing: at a place where the field ends, or where it is too rough.
         tiny = ~moved & ((t + dt <= t) | (dt <= 1e-6 * float(jnp.finfo(t.dtype).eps) * (self.t1 - self.t0)))
-        ended = jnp.stack([jnp.any(~jnp.isfinite(x)) for x in jax.tree.leaves(y1)]).any()
+        ended = ~_finite(y1)
         tiny = tiny & (result == RESULTS.successful)
         result = RESULTS.where(tiny & ended, RESULTS.nonfinite_field, result)
         result = RESULTS.where(tiny & ~ended, RESULTS.dt_min_reached, result)
@@ -332,17 +267,17 @@ class _Flow(eqx.Module):
 def _survey(coefficients: list, known: list) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Whether all coefficients are finite, and whether certainly no guard has a root on the step: one of its parts is
     positive in all coefficients but those which vanish with its known roots."""
-    finite = quiet = jnp.ones((), bool)
-    for row, roots in zip(coefficients, known):
-        clear = jnp.zeros((), bool)
-        for c, r in zip(row, roots):
-            positive = jnp.ones((), bool)
-            for j, value in enumerate(c):
-                positive = positive & ((value > 0) | (j < r) if j < 2 else value > 0)
-            clear = clear | positive
-            finite = finite & jnp.isfinite(sum(c))
-        quiet = quiet & clear
-    return finite, quiet
+
+    def least(c: list[Scalar], roots: Int[Array, ""]) -> Scalar:
+        return ft.reduce(jnp.minimum, [jnp.where(j < roots, 1, x) if j < 2 else x for j, x in enumerate(c)])
+
+    rows = [ft.reduce(jnp.maximum, map(least, row, roots)) for row, roots in zip(coefficients, known)]
+    return _finite(coefficients), once(ft.reduce(jnp.minimum, rows)) > 0
+
+
+def _finite(tree: Any) -> Bool[Array, ""]:
+    """Whether all numbers are finite: only then are all of their products with zero."""
+    return once(sum(jnp.sum(0 * x) for x in jax.tree.leaves(tree))) == 0
 
 
 def _landed(pred: Any, flow: _Flow, here: tuple, default: Landing) -> Landing:
@@ -379,7 +314,7 @@ def _run(
     model = Model(system, direction, start, y0)
     stepper = Stepper(solver)
     max_events = max_events if model.slots else 0
-    state, result = _start(model, start, y0, given)
+    state, result = start_mode(model, start, y0, given)
     f0 = model.flow(start, y0, state)
 
     def guard(i: int, ty: tuple[Scalar, Y]) -> list[Scalar]:
@@ -411,7 +346,7 @@ def _run(
         degree=max(8, stepper.degree + 3),
     )
     zero = jnp.zeros((), jnp.int32)
-    bad = ~jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((y0, f0, start, stop))]).all()
+    bad = ~_finite((y0, f0, start, stop))
     result = RESULTS.where(bad, RESULTS.nonfinite_field, result)
     carry = _Carry(
         t=start,

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._crossing import nodes, to_bernstein
+from ._once import once
 from ._types import Scalar, Y
 
 
@@ -90,7 +91,7 @@ class Stepper(eqx.Module):
         if isinstance(self.solver, dfx.AbstractERK):
             tableau = self.solver.tableau
             assert isinstance(tableau, dfx.ButcherTableau)
-            scale = ft.partial(jax.tree.map, lambda k: dt * k)
+            scale = ft.partial(jax.tree.map, lambda k: once(dt * k))
             ks, stage = [scale(f0)], y
             for row, c in zip(tableau.a_lower, tableau.c):
                 stage = _combine(y, list(zip(map(float, row), ks)))
@@ -119,7 +120,7 @@ class Stepper(eqx.Module):
                 rows.append(y1)
                 continue
             rise = jax.tree.map(lambda a, b: b - a, y, y1)
-            rows.append(_combine(y, [(float(row[1]), rise)] + [(float(w), k) for w, k in zip(row[2:], ks)]))
+            rows.append(once(_combine(y, [(float(row[1]), rise)] + [(float(w), k) for w, k in zip(row[2:], ks)])))
         return rows
 
     def _values(self, at: np.ndarray) -> np.ndarray:

@@ -156,3 +156,14 @@ def test_no_root_missed_and_none_out_of_order(count):
             if others[0] > 0:  # a simple root
                 slack = 1e-13 + 1e-14 / np.prod(others)
                 assert np.min(abs(t[i][sol.events.switch[i] == k] - root), initial=2) < slack, (i, KINDS[kind[i, k]])
+
+
+@pytest.mark.parametrize("degree", [2, 6, 9])
+def test_root_next_to_its_mirror_image(degree):
+    """δ² - τ² falls to zero at δ; with a small δ a step of Newton's or Halley's method from 0 says nothing."""
+    place = jax.jit(lambda c: first_root(c[None]))
+    for delta in 10.0 ** -np.arange(1, 8):
+        c = elevate(2, degree) @ np.array([delta**2, delta**2, delta**2 - 1])
+        found, root = place(jnp.asarray(c))
+        assert found
+        np.testing.assert_allclose(root, delta, rtol=1e-14 / delta)

@@ -13,6 +13,7 @@ PACKAGE = pathlib.Path(__file__).parents[1] / "nsjax"
 # Bottom to top: a module imports only modules named before it.
 ORDER = (
     "_types",
+    "_once",
     "_structure",
     "_system",
     "_compact",
@@ -24,6 +25,7 @@ ORDER = (
     "_save",
     "_event",
     "_check",
+    "_start",
     "_solve",
     "_saltation",
     "_variational",

@@ -1,0 +1,22 @@
+"""Values that a compiled program must compute once."""
+
+from typing import Any
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+
+def once(tree: Any) -> Any:
+    """The same numbers, computed once and stored.
+
+    XLA's CPU compiler copies elementwise arithmetic into every kernel that uses its result: without this each stage of
+    a Runge-Kutta step would be computed anew for every later stage, and again for every coefficient of a guard. It
+    never copies a division, so the values are divided by a one that it cannot know to be one (x == x fails for NaN).
+    """
+
+    def leaf(x: Array) -> Array:
+        return x / jnp.where(x == x, 1, lax.stop_gradient(x))
+
+    return jax.tree.map(leaf, tree)

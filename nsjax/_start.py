@@ -1,0 +1,78 @@
+"""The mode in which a solution sets out."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ._filippov import Model, State
+from ._solution import RESULTS
+from ._system import impact, relay
+from ._types import Scalar, Y
+
+
+def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[State, RESULTS]:
+    """The mode in which the solution sets out: from the signs of h, from `mode=`, and on a surface by the fields."""
+    modes, parts, roots, at = [], [], [], {}
+    result = RESULTS.successful
+    on = {}
+    for k, switch in enumerate(model.switches):
+        zero = jnp.zeros((), jnp.int32)
+        if isinstance(switch, relay):
+            up = switch.guard(model.system, t * model.direction, y) > 0
+            down = switch.off_guard(model.system, t * model.direction, y) > 0
+            held = jnp.asarray(given.get(switch.name, 0), jnp.int32)
+            modes.append(jnp.where(up & ~down, 1, jnp.where(down, 0, held)).astype(jnp.int32))
+            parts.append(None)
+            roots.append(zero)
+            continue
+        h = jnp.stack(model.h(k, t, y))
+        noise = model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y)
+        part = jnp.argmin(h)
+        h, noise = h[part], noise[part]
+        on[k] = jnp.abs(h) <= noise
+        parts.append(part.astype(jnp.int32) if model.parts[k] > 1 else None)
+        roots.append(zero)
+        if isinstance(switch, impact):
+            modes.append(zero)
+            result = RESULTS.where(h < -noise, RESULTS.wrong_mode, result)
+        elif switch.name in given:
+            mode = jnp.asarray(given[switch.name], jnp.int32)
+            # A state taken from an earlier solution may carry some drift off its surface.
+            off = jnp.where(mode == 0, jnp.abs(h) > 1e6 * noise, mode.astype(h.dtype) * h < -1e6 * noise)
+            result = RESULTS.where(off, RESULTS.wrong_mode, result)
+            modes.append(mode)
+            at[k] = jnp.zeros((), bool)
+            on[k] = mode.astype(h.dtype) * h <= noise
+        else:
+            modes.append(jnp.where(on[k], 0, jnp.sign(h)).astype(jnp.int32))
+            at[k] = on[k]
+    state = State(tuple(modes), tuple(parts), tuple(roots))
+    state, unsure, wrong = model.settle(t, y, state, at, {k: jnp.zeros((), jnp.int32) for k in at})
+    result = RESULTS.where(unsure, RESULTS.repulsive_sliding, result)
+    result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
+    # Guards of surfaces on which the start lies have a root there already.
+    roots = list(state.roots)
+    s = model.values(t, y, state)
+    for k, here in on.items():
+        rate = model._rates((k,), t, y, state, s)[0]
+        sign = jnp.where(jnp.asarray(isinstance(model.switches[k], impact)), 1, state.mode[k])
+        scale = jnp.sqrt(jnp.finfo(t.dtype).eps) * _size(model, k, t, y, state, s)
+        fresh = jnp.where(jnp.abs(rate) > scale, 1, 2)
+        settled = at.get(k, jnp.zeros((), bool))
+        roots[k] = jnp.where(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
+    return state._replace(roots=tuple(roots)), result
+
+
+def _size(model: Model, k: int, t: Scalar, y: Y, state: State, s: tuple) -> Scalar:
+    """The largest that dh/dt could be for the components of the field: what its rounding is measured by."""
+    f = model.field(t, y, s)
+    total = jnp.zeros((), t.dtype)
+    for i in range(len(jax.tree.leaves(f))):
+        only = jax.tree.unflatten(
+            jax.tree.structure(f),
+            [x if i == j else jnp.zeros_like(x) for j, x in enumerate(jax.tree.leaves(f))],
+        )
+        part = jax.jvp(lambda y: jnp.min(jnp.stack(model.h(k, t, y))), (y,), (only,))[1]
+        total = total + jnp.abs(part)
+    return total
