@@ -134,8 +134,9 @@ def _polish(c: Float[Array, " coefficients"]) -> Scalar:
         *_, done, count = state
         return ~done & (count < 100)
 
-    # A root at the very end is no place to start: an earlier one may be meant.
-    guess = once(jnp.where(c[-1] < 0, jnp.clip(c[0] / (c[0] - c[-1]), 0.0, 1.0), 0.5))
+    # A root at the very end is no place to start: an earlier one may be meant, and there the sign is rounding.
+    secant = c[0] / (c[0] - c[-1])
+    guess = once(jnp.where(secant < 0.99, secant, 0.5))
     state = (jnp.zeros_like(guess), jnp.ones_like(guess), guess, jnp.zeros((), bool), jnp.zeros((), jnp.int32))
     for _ in range(UNROLLED):
         state = improve(state)

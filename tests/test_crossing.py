@@ -97,6 +97,19 @@ def test_root_at_the_end_does_not_hide_an_earlier_one(end):
     assert found[0] and abs(evaluate(c[0, 0], tau[0])) < 1e-15 and tau[0] < 0.5
 
 
+def test_earlier_root_of_polynomials_that_vanish_at_the_end():
+    """Pitfall 9, many at once: the end value is rounding, of the sign that hides the last root."""
+    rng = np.random.default_rng(4)
+    count = 2000
+    r = np.stack([rng.uniform(0.02, 0.95, count), np.ones(count), 1 + 10.0 ** rng.uniform(-3, -1, count)], -1)
+    c = bernstein(from_roots(np.concatenate([r, r[:, 2:]], -1)))
+    c *= np.sign(c[:, :1])
+    c[:, -1] = -1e-17
+    found, tau = search(jnp.asarray(c)[:, None])
+    assert np.all(found)
+    np.testing.assert_allclose(tau, r[:, 0], atol=1e-11)
+
+
 def test_maximum_of_two_parts():
     """A slot is the maximum over its parts: it fires when the last of them has become non-positive."""
     a, b = bernstein(from_roots(np.array([[0.3, 1.2], [0.6, 0.7]])))
