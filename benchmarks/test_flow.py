@@ -48,7 +48,7 @@ def sweep(system, y0, t1, values, **kwargs):
         )
         return sol.y1, sol.stats["num_steps"], sol.stats["num_events"]
 
-    return jax.jit(lambda v: jax.lax.map(lane, v, batch_size=1024)), values
+    return jax.jit(lambda v: jax.lax.map(lane, v, batch_size=256)), values
 
 
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Dopri8()], ids=["Tsit5", "Dopri8"])
