@@ -123,14 +123,12 @@ def _given(system: System, mode: Any) -> dict[str, Any]:
                 f"Argument `mode` must have one value for each of the {len(switches)} switches "
                 f"({', '.join(switches)}), but got {len(values)}."
             )
-        mode = {n: v for (n, k), v in zip(switches.items(), values) if not isinstance(k, impact)}
+        mode = dict(zip(switches, values))
     for name, value in mode.items():
         if name not in switches:
             known = ", ".join(f"`{n}`" for n in switches) or "none"
             raise ValueError(f"Argument `mode` must name switches of the system, but got `{name}`; they are: {known}.")
-        if isinstance(switches[name], impact):
-            raise ValueError(f"Argument `mode` must not name `{name}`: an impact surface has no mode to choose.")
-        allowed = (0, 1) if isinstance(switches[name], relay) else (-1, 0, 1)
+        allowed = (-1, 0, 1) if isinstance(switches[name], sgn) else (0, 1)
         if isinstance(value, int) and value not in allowed:
             raise ValueError(f"Argument `mode` must give `{name}` one of {allowed}, but got {value}.")
     return {n: jnp.asarray(v, jnp.int32) for n, v in mode.items()}

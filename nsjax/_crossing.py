@@ -43,11 +43,11 @@ def to_chebyshev(degree: int) -> np.ndarray:
 
 
 def deflate(c: Float[Array, "... coefficients"], roots: Int[Array, "..."]) -> Float[Array, "... coefficients"]:
-    """Divides by τ once or twice (`roots` = 1 or 2), keeping the degree: takes out known roots at τ = 0."""
+    """Divides by τ up to three times (`roots` of them), keeping the degree: takes out known roots at τ = 0."""
     n = c.shape[-1] - 1
     j = np.arange(n + 1)
 
-    def once(c: Array) -> Array:
+    def divided(c: Array) -> Array:
         # τ B_{j-1}^{n-1} = (j/n) B_j^n, so q = c_j n/j of degree n-1; then elevated to degree n.
         q = c[..., 1:] * jnp.asarray(n / j[1:], c.dtype)
         lower = jnp.concatenate([q[..., :1], q], axis=-1)
@@ -55,12 +55,14 @@ def deflate(c: Float[Array, "... coefficients"], roots: Int[Array, "..."]) -> Fl
         up = jnp.asarray(j / n, c.dtype)
         return up * lower + (1 - up) * upper
 
-    first = once(c)
+    first = divided(c)
+    second = divided(first)
     roots = roots[..., None]
-    # Dividing twice a polynomial of degree n = 1 leaves only the slope, which is what `once` of `once` gives.
+    # Dividing twice a polynomial of degree n = 1 leaves only the slope, which is what dividing it again gives.
     # A second root within rounding of the first cannot be told from a double one.
     double = jnp.abs(first[..., :1]) <= 1e-10 * jnp.max(jnp.abs(first), axis=-1, keepdims=True)
-    return jnp.where(roots == 0, c, jnp.where((roots == 1) & ~double, first, once(first)))
+    many = jnp.where(roots == 3, divided(second), second)
+    return jnp.where(roots == 0, c, jnp.where((roots == 1) & ~double, first, many))
 
 
 @ft.lru_cache

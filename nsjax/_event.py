@@ -10,8 +10,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._crossing import first_root
 from ._filippov import Model, State
+from ._settle import settle
 from ._solution import RESULTS
 from ._step import stack, Stepper
+from ._structure import is_constant
 from ._system import frozen, impact, relay, sgn
 from ._types import Scalar, Y
 
@@ -21,7 +23,7 @@ class Landing(NamedTuple):
 
     found: Bool[Array, ""]
     t: Scalar  # of the event
-    t_after: Scalar  # the same, but for an accumulation of impacts that was completed
+    t_after: Scalar  # the same, but for an accumulation of impacts that was completed: its time
     y_before: Y
     y_after: Y
     f_after: Y
@@ -122,11 +124,6 @@ def locate(
     return jnp.any(found), te, y_end, increments, slot, part[slot]
 
 
-def _rate(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
-    """dh/dt of an impact surface along the flow (the active component of h)."""
-    return model._rates((k,), t, y, state, model.values(t, y, state))[0]
-
-
 def _derivative(model: Model, fn: Any, t: Scalar, y: Y, state: State) -> Scalar:
     """d/dt of `fn(t, y)` along the flow."""
     return jax.jvp(fn, (t, y), (jnp.ones_like(t), model.flow(t, y, state)))[1]
@@ -135,7 +132,8 @@ def _derivative(model: Model, fn: Any, t: Scalar, y: Y, state: State) -> Scalar:
 def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> Y:
     """The state after an impact: the user's reset, or Newton's law with the impulse along ∂f/∂s.
 
-    Backwards in time Newton's law is inverted (1/e).
+    Contacts that rest take impulses of their own, as far as these push; friction that the contact force enters acts in
+    the impact too, up to where it stops the sliding. Backwards in time Newton's law is inverted (1/e).
     """
     switch = model.switches[k]
     assert isinstance(switch, impact)
@@ -144,12 +142,52 @@ def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> Y:
     assert switch.restitution_fn is not None
     e = jnp.asarray(switch.restitution_fn(model.system), t.dtype)
     e = jnp.where(model.direction > 0, e, 1 / e)
+    which = (k, *[j for j in model.contacts if j != k and k in model.contacts])
+    takes_part = jnp.stack([jnp.ones((), bool)] + [state.mode[j] == 1 for j in which[1:]])
+
+    def opening(y: Y) -> list[Scalar]:
+        # Only dh/dt depends on the velocities, and for given positions it is affine in them.
+        return [model.level(j, t, y, state) if j in model.contacts else model.approach(j, t, y, state) for j in which]
+
+    def hit(s: tuple) -> Y:
+        def push(j: int) -> Y:
+            unit = tuple(jnp.where(i == j, 1, 0).astype(t.dtype) for i in range(len(s)))
+            return jax.jvp(lambda s: model.field(t, y, s), (s,), (unit,))[1]
+
+        pushes = [push(j) for j in which]
+        rates = opening(y)
+        gains = [jax.jvp(opening, (y,), (p,))[1] for p in pushes]
+        if len(which) == 1:
+            impulses = [-(1 + e) * rates[0] / gains[0][0]]
+        else:
+            want = jnp.stack([-(1 + e) * rates[0]] + [-r for r in rates[1:]])
+            matrix = jnp.stack([jnp.stack(g) for g in gains], axis=1)
+            held = takes_part
+            for _ in which[1:]:
+                square = jnp.where(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
+                p = jnp.linalg.solve(square, jnp.where(held, want, 0))
+                held = held & ((p >= 0) | (jnp.arange(len(which)) == 0))  # no contact pulls
+            square = jnp.where(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
+            impulses = list(jnp.linalg.solve(square, jnp.where(held, want, 0)))
+        out = y
+        for p, direction in zip(impulses, pushes):
+            out = jax.tree.map(lambda a, b, p=p: a + p * b, out, direction)
+        return out
+
     s = model.values(t, y, state)
-    unit = tuple(jnp.where(i == k, 1, 0).astype(t.dtype) for i in range(len(s)))
-    push = jax.jvp(lambda s: model.field(t, y, s), (s,), (unit,))[1]
-    # Only h' depends on the velocities, and for given positions it is affine in them.
-    rate, gain = jax.jvp(lambda y: _rate(model, k, t, y, state), (y,), (push,))
-    return jax.tree.map(lambda a, b: a - (1 + e) * rate / gain * b, y, push)
+    for j in model.holdable:
+        if j in model.contacts or is_constant(lambda sj, j=j: hit(s[:j] + (sj,) + s[j + 1 :]), s[j]):
+            continue
+
+        def slip(sj: Scalar, j: int = j) -> Scalar:
+            return model.level(j, t, hit(s[:j] + (sj,) + s[j + 1 :]), state)
+
+        # Where friction would reverse the sliding it ends it: the value that does so is found by one Newton step.
+        end, slope = jax.jvp(slip, (s[j],), (jnp.ones_like(s[j]),))
+        reverses = (state.mode[j] != 0) & (model.level(j, t, y, state) * end < 0) & (slope != 0)
+        stop = s[j] - end / jnp.where(slope == 0, 1, slope)
+        s = s[:j] + (jnp.where(reverses & (jnp.abs(stop) <= 1), stop, s[j]),) + s[j + 1 :]
+    return hit(s)
 
 
 def land(
@@ -171,9 +209,9 @@ def land(
     bounds = {k: jnp.zeros((), jnp.int32) for k in range(len(model.switches))}
     tip = dict(fired)
     parts, roots, modes = list(state.part), list(state.roots), list(state.mode)
-    for i, (k, number, sliding) in enumerate(model.slots):
+    for i, (k, number, holding) in enumerate(model.slots):
         now = slot == i
-        if sliding:
+        if holding:
             bounds[k] = jnp.where(now, number, bounds[k])
             continue
         fired[k] = fired[k] | now
@@ -182,7 +220,7 @@ def land(
             parts[k] = jnp.where(now, jnp.where(state.mode[k] < 0, part.astype(jnp.int32), number), parts[k])
 
     result = RESULTS.successful
-    after, at = before, {}
+    after = before
     for k, switch in enumerate(model.switches):
         roots[k] = jnp.where(halted, roots[k], 0)
         if isinstance(switch, relay):
@@ -190,6 +228,7 @@ def land(
         elif isinstance(switch, impact):
             hit = rebound(model, k, te, before, state._replace(part=tuple(parts)))
             after = jax.tree.map(lambda a, b, now=fired[k]: jnp.where(now, a, b), hit, after)
+    at = {}
     for k, switch in enumerate(model.switches):
         if isinstance(switch, sgn):
             # The end of a surface at its tip leads into h < 0.
@@ -206,13 +245,41 @@ def land(
                 here = (here & ~moved) | (moved & (h1 == 0))
             at[k] = here
     state_after = State(tuple(m.astype(jnp.int32) for m in modes), tuple(parts), tuple(roots))
-    # What cannot slide crosses when it fires, but for the residual of an event a few ulps earlier, which dh/dt tells.
-    crosses = {k: fired[k] & ~(halted & (state.roots[k] == 0)) for k in fired}
-    bounds = {k: b if k in model.slidable else crosses[k].astype(jnp.int32) for k, b in bounds.items()}
-    state_after, _, wrong = model.settle(te, after, state_after, at, bounds)
-    result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
 
-    t_after, roots = te, list(state_after.roots)
+    t_after, jumped = te, after
+    for k, switch in enumerate(model.switches):
+        if not isinstance(switch, impact):
+            continue
+        end = completed(model, k, te, before, jumped, state, state_after)
+        eps = jnp.finfo(te.dtype).eps
+        brief = jnp.maximum(jnp.sqrt(eps) * (te - t_start), 1e4 * eps * jnp.abs(te))
+        ends = fired[k] & end.possible & ((end.flight <= brief) | end.low)
+        t_after, after = jax.tree.map(
+            lambda a, b, ends=ends: jnp.where(ends, a, b), (te + end.rest, end.y), (t_after, after)
+        )
+        result = RESULTS.where(fired[k] & end.wrong, RESULTS.wrong_reset, result)
+        fresh = jnp.where(end.stays, jnp.where(end.rise > 0, 1, 2), 0)
+        roots[k] = jnp.where(fired[k], fresh, roots[k]).astype(jnp.int32)
+        if k in model.contacts:
+            # Another impact may set a resting contact in motion: it lifts off, or is hit at once.
+            level = model.level(k, te, jumped, state_after)
+            moved = (state.mode[k] == 1) & (level != model.level(k, te, before, state_after))
+            modes[k] = jnp.where(moved, 0, modes[k])
+            roots[k] = jnp.where(moved, (level > 0).astype(jnp.int32), roots[k])
+            at[k] = ends | ((state.mode[k] == 1) & ~moved)
+        else:
+            result = RESULTS.where(ends, RESULTS.accumulation_reached, result)
+    at = {k: at[k] for k in sorted(at)}
+    state_after = State(tuple(m.astype(jnp.int32) for m in modes), tuple(parts), tuple(roots))
+    # What cannot be held crosses when it fires, but for the residual of an event a few ulps earlier, which dh/dt tells.
+    crosses = {k: fired[k] & ~(halted & (state.roots[k] == 0)) for k in fired}
+    bounds = {k: b if k in model.holdable else crosses[k].astype(jnp.int32) for k, b in bounds.items()}
+    state_after, _, wrong = settle(model, t_after, after, state_after, at, bounds)
+    result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
+    if model.contacts:
+        after = model.project(t_after, after, state_after)
+
+    roots = list(state_after.roots)
     guards = model.guards(te, after, state_after) if any(isinstance(s, relay) for s in model.switches) else None
     for k, switch in enumerate(model.switches):
         if isinstance(switch, relay):
@@ -221,64 +288,59 @@ def land(
             first = next(i for i, s in enumerate(model.slots) if s.switch == k)
             noise = model.rounding(lambda t, y, first=first: (model.guards(t, y, state_after)[first][0],), te, after)[0]
             roots[k] = jnp.where(fired[k], (jnp.abs(guards[first][0]) <= noise).astype(jnp.int32), roots[k])
-        elif isinstance(switch, impact):
-            t_after, after, roots[k], failed = _rebounded(
-                model, k, fired[k], t_start, te, before, state, t_after, after, state_after, roots[k]
-            )
-            result = RESULTS.where(failed == 1, RESULTS.wrong_reset, result)
-            result = RESULTS.where(failed == 2, RESULTS.accumulation_reached, result)
     state_after = state_after._replace(roots=tuple(roots))
     news = jnp.zeros((), bool)
     for k, switch in enumerate(model.switches):
-        news = news | (fired[k] if isinstance(switch, impact) else state_after.mode[k] != state.mode[k])
+        news = news | (state_after.mode[k] != state.mode[k])
+        if isinstance(switch, impact):
+            news = news | fired[k]
     points = stack(stepper.points(y, before, increments)) if want_points else None
     f_after = model.flow(t_after, after, state_after)
     return Landing(found, te, t_after, before, after, f_after, state_after, slot, news, points, result)
 
 
-def _rebounded(
-    model: Model,
-    k: int,
-    fired: Bool[Array, ""],
-    t_start: Scalar,
-    te: Scalar,
-    before: Y,
-    state: State,
-    t_after: Scalar,
-    after: Y,
-    state_after: State,
-    roots: Int[Array, ""],
-) -> tuple[Scalar, Y, Int[Array, ""], Int[Array, ""]]:
-    """Checks an impact, and ends a sequence of ever shorter flights at its accumulation point.
+class Completed(NamedTuple):
+    """What an impact leads to: a flight, or with all the flights that would follow it a state of rest."""
+
+    rise: Scalar  # dh/dt after the impact
+    flight: Scalar  # how long the next flight lasts
+    rest: Scalar  # how long all flights together last
+    y: Y  # the state after all of them
+    possible: Bool[Array, ""]  # whether the flights become ever shorter
+    low: Bool[Array, ""]  # whether the next one rises so little above the rounding of h that its end is uncertain
+    stays: Bool[Array, ""]  # on the surface: a reset of the user's own may carry the state off it
+    wrong: Bool[Array, ""]  # whether the reset leads to the forbidden side
+
+
+def completed(model: Model, k: int, te: Scalar, before: Y, after: Y, state: State, state_after: State) -> Completed:
+    """Checks an impact, and sums the sequence of ever shorter flights that follows it up to its accumulation point.
 
     With the velocity h' after the impact, the acceleration h'' < 0 and the ratio r = -h'(t+)/h'(t-) < 1 the remaining
     flights last 2 h' / (-h'') (1 + r + r² + ...).
     """
 
     def rate(t: Scalar, y: Y) -> Scalar:
-        return _rate(model, k, t, y, state_after)
+        return model.approach(k, t, y, state_after)
 
-    speed = _rate(model, k, te, before, state)
+    speed = model.approach(k, te, before, state)
     rise = rate(te, after)
-    pull = _derivative(model, rate, te, after, state_after)
+    f = model.flow(te, after, state_after)
+    pull = jax.jvp(rate, (te, after), (jnp.ones_like(te), f))[1]
     h = jnp.stack(model.h(k, te, after))
     noise = model.rounding(lambda t, y: model.h(k, t, y), te, after)
     slack = 1e4 * noise + 2 * jnp.abs(jnp.stack(model.h(k, te, before)))
     part = 0 if state_after.part[k] is None else state_after.part[k]
-    stays = jnp.abs(h[part]) <= slack[part]  # on its surface: a reset of the user's own may carry the state off it
-    wrong = fired & (jnp.any(h < -slack) | (stays & (rise < -1e-9 * jnp.abs(speed))))
+    stays = jnp.abs(h[part]) <= slack[part]
+    wrong = jnp.any(h < -slack) | (stays & (rise < -1e-9 * jnp.abs(speed)))
 
     ratio = jnp.where(speed == 0, 0, -rise / jnp.where(speed == 0, 1, speed))
-    flight = 2 * rise / -pull
-    short = flight <= jnp.sqrt(jnp.finfo(te.dtype).eps) * (te - t_start)
-    ends = fired & stays & ~wrong & (pull < 0) & (ratio < 1) & short
-    rest = jnp.where(ends, flight / (1 - ratio), 0)
-    drift = jax.tree.map(lambda x, f: x + rest * f, after, model.flow(te, after, state_after))
+    flight = 2 * rise / jnp.where(pull < 0, -pull, 1)
+    possible = stays & ~wrong & (pull < 0) & (ratio < 1)
+    rest = jnp.where(possible, flight / (1 - jnp.where(possible, ratio, 0)), 0)
+    drift = jax.tree.map(lambda x, f: x + rest * f, after, f)
     impulse = jax.tree.map(jnp.subtract, after, before)
     left, gain = jax.jvp(lambda y: rate(te, y), (drift,), (impulse,))
     scale = jnp.where(gain == 0, 0, left / jnp.where(gain == 0, 1, gain))
-    settled = jax.tree.map(lambda x, d: x - scale * d, drift, impulse)
-    after = jax.tree.map(lambda a, b: jnp.where(ends, a, b), settled, after)
-    simple = rise > 0
-    roots = jnp.where(fired, jnp.where(stays, jnp.where(simple, 1, 2), 0), roots).astype(jnp.int32)
-    return t_after + rest, after, roots, jnp.where(wrong, 1, jnp.where(ends, 2, 0))
+    rested = jax.tree.map(lambda x, d: x - scale * d, drift, impulse)
+    low = 0.25 * flight * rise <= 1e3 * noise[part]
+    return Completed(rise, flight, rest, rested, possible, low, stays, wrong)

@@ -1,8 +1,9 @@
-"""The field in a mode, Filippov's multipliers, and the choice of mode where switches are at their surfaces.
+"""The field in a mode, with the multipliers of the surfaces that hold it, and the guards of the mode.
 
 A mode is one small integer for each switch: for `sgn` the sign +1 or -1 of its region, or 0 while sliding; for
-`relay` 0 or 1; for `impact` 0. There is no enumeration of the 3^m combinations: sliding on m surfaces at once solves
-the m equations n_i . f(t, y, λ) + ∂h_i/∂t = 0 for the m multipliers, (2.19)-(2.20).
+`relay` 0 or 1; for `impact` 0 in free flight, 1 in resting contact. There is no enumeration of the 3^m combinations:
+being held on m surfaces at once solves m equations for the m multipliers, n_i . f(t, y, λ) + ∂h_i/∂t = 0 for sliding,
+(2.19)-(2.20), and d²h_i/dt² = 0 for contact, whose multiplier is the contact force.
 """
 
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._structure import is_affine, is_constant
-from ._system import AbstractSwitch, frozen, impact, relay, sgn, System
+from ._system import AbstractSwitch, impact, relay, sgn, System
 from ._types import Mode, Scalar, Y
 
 
@@ -24,7 +25,7 @@ class Slot(NamedTuple):
 
     switch: int  # position of its switch
     part: int  # component of h, or the sign of the bound that λ reaches
-    sliding: bool  # whether it watches λ
+    holding: bool  # whether it watches λ
 
 
 class State(NamedTuple):
@@ -50,7 +51,8 @@ class Model(eqx.Module):
     direction: Any  # +1 or -1
     switches: tuple[AbstractSwitch, ...] = eqx.field(static=True)
     parts: tuple[int, ...] = eqx.field(static=True)  # number of components of h, per switch
-    slidable: tuple[int, ...] = eqx.field(static=True)  # sgn switches whose value enters the rate of their own h
+    holdable: tuple[int, ...] = eqx.field(static=True)  # switches whose value can hold the solution on their surface
+    contacts: tuple[int, ...] = eqx.field(static=True)  # the impacts among them
     jointly_affine: bool = eqx.field(static=True)
     slots: tuple[Slot, ...] = eqx.field(static=True)
 
@@ -60,23 +62,33 @@ class Model(eqx.Module):
         self.switches = system.switches
         self.parts = tuple(len(k.components(system, t, y)) for k in self.switches)
         zeros = tuple(jnp.zeros((), jnp.result_type(t)) for _ in self.switches)
+        one = jnp.ones_like(t)
 
-        def rate(k: int, t: Scalar, y: Y, s: tuple) -> tuple:
-            f = self.field(t, y, s)
-            return jax.jvp(lambda t, y: self.h(k, t, y), (t, y), (jnp.ones_like(t), f))[1]
+        def rate(k: int, t: Scalar, y: Y, s: tuple) -> Any:
+            return jax.jvp(lambda t, y: self.h(k, t, y), (t, y), (one, self.field(t, y, s)))[1]
 
-        self.slidable = tuple(
-            k
-            for k, switch in enumerate(self.switches)
-            if isinstance(switch, sgn)
-            and not is_constant(lambda sk, k=k: rate(k, t, y, zeros[:k] + (sk,) + zeros[k + 1 :]), zeros[k])
-        )
+        def second(k: int, s: tuple) -> Any:
+            return jax.jvp(lambda t, y: rate(k, t, y, zeros), (t, y), (one, self.field(t, y, s)))[1]
+
+        def acts(fn: Any, k: int) -> bool:
+            return not is_constant(lambda sk: fn(zeros[:k] + (sk,) + zeros[k + 1 :]), zeros[k])
+
+        def holds(k: int) -> bool:
+            if isinstance(self.switches[k], sgn):
+                return acts(lambda s: rate(k, t, y, s), k)
+            # A contact force that acts on velocities, and so on d²h/dt²; the corner of two walls cannot hold.
+            smooth = isinstance(self.switches[k], impact) and self.parts[k] == 1
+            return smooth and is_constant(lambda s: rate(k, t, y, s), zeros) and acts(lambda s: second(k, s), k)
+
+        self.holdable = tuple(k for k in range(len(self.switches)) if holds(k))
+        self.contacts = tuple(k for k in self.holdable if isinstance(self.switches[k], impact))
         self.jointly_affine = is_affine(lambda s: self.field(t, y, s), zeros)
         slots = []
         for k, switch in enumerate(self.switches):
             number = 1 if isinstance(switch, relay) else self.parts[k]
             slots += [Slot(k, part, False) for part in range(number)]
-            slots += [Slot(k, sign, True) for sign in (1, -1) if k in self.slidable]
+            if k in self.holdable:
+                slots += [Slot(k, sign, True) for sign in ((1,) if k in self.contacts else (1, -1))]
         self.slots = tuple(slots)
 
     # The smooth field for given switch values, and the indicator functions.
@@ -93,90 +105,131 @@ class Model(eqx.Module):
         assert isinstance(switch, sgn)
         return switch.bound(self.system)
 
-    def _rates(self, which: tuple[int, ...], t: Scalar, y: Y, state: State, s: tuple) -> tuple[Scalar, ...]:
-        """dh/dt along the field with switch values `s`, of the active component of each switch in `which`."""
+    def held(self, k: int, mode: Any) -> Bool[Array, ""]:
+        """Whether `mode` of switch k holds the solution on its surface."""
+        return mode == (1 if k in self.contacts else 0)
 
-        def hs(t: Scalar, y: Y) -> tuple[Scalar, ...]:
-            return tuple(_pick(self.h(k, t, y), state.part[k]) for k in which)
+    def level(self, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+        """What its multiplier keeps at zero: the active component of h; for a contact dh/dt, as forces act on that."""
 
-        return jax.jvp(hs, (t, y), (jnp.ones_like(t), self.field(t, y, s)))[1]
+        def h(t: Scalar, y: Y) -> Scalar:
+            return _pick(self.h(k, t, y), state.part[k])
+
+        if k not in self.contacts:
+            return h(t, y)
+        zeros = tuple(jnp.zeros((), t.dtype) for _ in self.switches)
+        return jax.jvp(h, (t, y), (jnp.ones_like(t), self.field(t, y, zeros)))[1]
+
+    def rates(self, which: tuple[int, ...], t: Scalar, y: Y, state: State, s: tuple) -> tuple[Scalar, ...]:
+        """The rates of change of `level` for each switch in `which`, for switch values `s`."""
+
+        def levels(t: Scalar, y: Y) -> tuple[Scalar, ...]:
+            return tuple(self.level(k, t, y, state) for k in which)
+
+        return jax.jvp(levels, (t, y), (jnp.ones_like(t), self.field(t, y, s)))[1]
+
+    def approach(self, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+        """dh/dt of switch k along the flow (the active component of h)."""
+        f = self.flow(t, y, state)
+        return jax.jvp(lambda t, y: _pick(self.h(k, t, y), state.part[k]), (t, y), (jnp.ones_like(t), f))[1]
 
     def _signs(self, t: Scalar, state: State) -> tuple[Any, ...]:
-        """Switch values of a mode, with 0 for those which slide."""
+        """Switch values of a mode, with 0 for those which are held, and for contacts."""
         return tuple(
             jnp.zeros((), t.dtype) if isinstance(switch, impact) else m.astype(t.dtype)
             for switch, m in zip(self.switches, state.mode)
         )
 
-    def _linear(self, t: Scalar, y: Y, state: State, s: tuple) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
-        """Rates of the slidable surfaces at `s`, and their derivatives with respect to the slidable values."""
-        which = self.slidable
+    def linear(self, t: Scalar, y: Y, state: State, s: tuple) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
+        """Rates of the holdable surfaces at `s`, and their derivatives with respect to the holdable values."""
+        which = self.holdable
 
         def rates(sigma: Float[Array, " m"]) -> Float[Array, " m"]:
             full = list(s)
             for i, k in enumerate(which):
                 full[k] = sigma[i]
-            return jnp.stack(self._rates(which, t, y, state, tuple(full)))
+            return jnp.stack(self.rates(which, t, y, state, tuple(full)))
 
         sigma = jnp.stack([s[k] for k in which])
-        return rates(sigma), jax.jacfwd(rates)(sigma)
+        slope = jax.jacfwd(rates)(sigma)
+        if self.contacts and len(which) > 1:
+            # Friction along a contact that holds already is free: a trace of compliance gives it the value 0.
+            dry = jnp.asarray([k not in self.contacts for k in which])
+            slope -= jnp.diag(jnp.where(dry, 4 * jnp.finfo(t.dtype).eps * jnp.sum(jnp.abs(slope), axis=1), 0))
+        return rates(sigma), slope
 
     def values(self, t: Scalar, y: Y, state: State) -> tuple[Any, ...]:
-        """The value of every switch in a mode: signs, and the multipliers λ of those that slide, (2.20)."""
+        """The value of every switch in a mode: signs, and the multipliers λ of those that are held, (2.20)."""
         s = self._signs(t, state)
-        which = self.slidable
+        which = self.holdable
         if not which:
             return s
         if len(which) == 1:
             (k,) = which
 
             def rate(sk: Scalar) -> Scalar:
-                return self._rates(which, t, y, state, s[:k] + (sk,) + s[k + 1 :])[0]
+                return self.rates(which, t, y, state, s[:k] + (sk,) + s[k + 1 :])[0]
 
             zero = jnp.zeros((), t.dtype)
             r, slope = jax.jvp(rate, (zero,), (jnp.ones_like(zero),))
-            slides = state.mode[k] == 0
+            held = self.held(k, state.mode[k])
             # A vanishing slope off the surface is no fault; on it the quotient is infinite, and so is found.
-            lam = -r / jnp.where(slides, slope, 1)
-            return s[:k] + (jnp.where(slides, lam, s[k]),) + s[k + 1 :]
-        slides = jnp.stack([state.mode[k] == 0 for k in which])
+            lam = -r / jnp.where(held, slope, 1)
+            return s[:k] + (jnp.where(held, lam, s[k]),) + s[k + 1 :]
+        held = jnp.stack([self.held(k, state.mode[k]) for k in which])
         eye = jnp.eye(len(which), dtype=t.dtype)
-        # Multi-affine fields need Newton's method, which for jointly affine ones ends after one step.
-        for _ in range(1 if self.jointly_affine else 6):
-            r, slope = self._linear(t, y, state, s)
-            step = jnp.linalg.solve(jnp.where(slides[:, None], slope, eye), jnp.where(slides, -r, 0))
+
+        def put(sigma: Float[Array, " m"]) -> tuple[Any, ...]:
             full = list(s)
             for i, k in enumerate(which):
-                full[k] = s[k] + step[i]
-            s = tuple(full)
-        return s
+                full[k] = sigma[i]
+            return tuple(full)
+
+        def newton(_: Any, sigma: Float[Array, " m"]) -> Float[Array, " m"]:
+            r, slope = self.linear(t, y, state, put(sigma))
+            return sigma + jnp.linalg.solve(jnp.where(held[:, None], slope, eye), jnp.where(held, -r, 0))
+
+        sigma = jnp.stack([s[k] for k in which])
+        if self.jointly_affine:
+            return put(newton(0, sigma))
+        # Newton's method for a multi-affine field. Friction proportional to a contact force has no say where that is
+        # zero: the search sets out from another value.
+        force = jnp.asarray([k in self.contacts for k in which])
+        return put(lax.fori_loop(0, 6, newton, jnp.where(held & force, 1, sigma)))
 
     def flow(self, t: Scalar, y: Y, state: State) -> Y:
         """The right-hand side in a mode; for a sliding one it is Filippov's field (2.19)."""
         return self.field(t, y, self.values(t, y, state))
 
     def project(self, t: Scalar, y: Y, state: State) -> Y:
-        """Removes the drift off the surfaces on which the solution slides.
+        """Removes the drift off the surfaces that hold the solution.
 
         The state moves along ∂f/∂s, the direction in which the switch acts, so that the result does not depend on the
-        units of the state. One Newton step: exact when h is affine, else quadratic in a drift that is itself of the
-        order of the local error.
+        units of the state; positions move along what this is in a unit of time. One Newton step: exact when h is
+        affine, else quadratic in a drift that is itself of the order of the local error.
         """
-        which = self.slidable
+        which = self.holdable
         if not which:
             return y
         s = self.values(t, y, state)
-        slides = jnp.stack([state.mode[k] == 0 for k in which])
-        h = jnp.stack([_pick(self.h(k, t, y), state.part[k]) for k in which])
-        _, slope = self._linear(t, y, state, s)
-        slope = jnp.where(slides[:, None] & slides[None, :], slope, jnp.eye(len(which), dtype=t.dtype))
-        h = jnp.where(slides, h, 0)
-        push = -h / slope[0] if len(which) == 1 else jnp.linalg.solve(slope, -h)
-        ds = [jnp.zeros_like(v) for v in s]
-        for i, k in enumerate(which):
-            ds[k] = jnp.where(slides[i], push[i], 0)
-        _, dy = jax.jvp(lambda s: self.field(t, y, s), (s,), (tuple(ds),))
-        return jax.tree.map(jnp.add, y, dy)
+        held = jnp.stack([self.held(k, state.mode[k]) for k in which])
+        _, slope = self.linear(t, y, state, s)
+        slope = jnp.where(held[:, None] & held[None, :], slope, jnp.eye(len(which), dtype=t.dtype))
+
+        def push(y: Y, gaps: list[Scalar]) -> Y:
+            """∂f/∂s times the values which close the gaps."""
+            gap = jnp.where(held, jnp.stack(gaps), 0)
+            move = -gap / slope[0] if len(which) == 1 else jnp.linalg.solve(slope, -gap)
+            ds = [jnp.zeros_like(v) for v in s]
+            for i, k in enumerate(which):
+                ds[k] = jnp.where(held[i], move[i], 0)
+            return jax.jvp(lambda s: self.field(t, y, s), (s,), (tuple(ds),))[1]
+
+        if self.contacts:
+            gaps = [self.h(k, t, y)[0] if k in self.contacts else jnp.zeros_like(t) for k in which]
+            dq = jax.jvp(lambda y: self.field(t, y, s), (y,), (push(y, gaps),))[1]
+            y = jax.tree.map(jnp.add, y, dq)
+        return jax.tree.map(jnp.add, y, push(y, [self.level(k, t, y, state) for k in which]))
 
     # Guards: positive while the mode lasts. Slot i is the maximum over the last axis, so that the event is the
     # instant at which all of its entries have become non-positive.
@@ -189,18 +242,20 @@ class Model(eqx.Module):
         """`guards[slot][part]`, as scalars: stacked arrays of length two or five cost XLA's CPU code several times as
         much."""
         one = jnp.ones((), t.dtype)
-        s = self.values(t, y, state) if self.slidable else ()
+        s = self.values(t, y, state) if self.holdable else ()
         rows = []
         for slot in self.slots:
             k, switch, mode = slot.switch, self.switches[slot.switch], state.mode[slot.switch]
-            if slot.sliding:
-                row = [jnp.where(mode == 0, self.bound(k) - slot.part * s[k], one)]
+            if slot.holding:
+                left = s[k] if k in self.contacts else self.bound(k) - slot.part * s[k]
+                row = [jnp.where(self.held(k, mode), left, one)]
             elif isinstance(switch, relay):
                 on = switch.guard(self.system, t * self.direction, y)
                 off = switch.off_guard(self.system, t * self.direction, y)
                 row = [-jnp.where(mode == 1, off, on)]
             elif isinstance(switch, impact):
-                row = [self.h(k, t, y)[slot.part]]
+                gap = self.h(k, t, y)[slot.part]
+                row = [jnp.where(mode == 1, one, gap) if k in self.contacts else gap]
             elif self.parts[k] == 1:
                 row = [jnp.where(mode == 0, one, mode.astype(t.dtype) * self.h(k, t, y)[0])]
             else:
@@ -228,9 +283,9 @@ class Model(eqx.Module):
         """How many roots each guard has at the present instant (just left, so not to be found again)."""
         rows = []
         none = jnp.zeros((), jnp.int32)
-        for k, j, sliding in self.slots:
+        for k, j, holding in self.slots:
             roots, mode, part = state.roots[k], state.mode[k], state.part[k]
-            if sliding:
+            if holding:
                 row = [none]
             elif part is None:
                 row = [roots]
@@ -249,112 +304,3 @@ class Model(eqx.Module):
         flat, unravel = jfu.ravel_pytree(y)
         dt, dy = jax.jacfwd(lambda t, y: jnp.stack(fn(t, unravel(y))), argnums=(0, 1))(t, flat)
         return 8 * jnp.finfo(t.dtype).eps * (jnp.abs(dt * t) + jnp.sum(jnp.abs(dy * flat), axis=-1))
-
-    # The choice of mode.
-
-    def settle(
-        self, t: Scalar, y: Y, state: State, at: dict[int, Bool[Array, ""]], leaves: dict[int, Int[Array, ""]]
-    ) -> tuple[State, Bool[Array, ""], Bool[Array, ""]]:
-        """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}.
-
-        All of them stick if that is valid (|λ| <= b). Otherwise the worst |λ|/b is released to the sign of its λ, and
-        a released switch whose dh/dt then opposes its sign is taken back, until nothing is violated.
-
-        **Arguments:**
-
-        - `state`: the mode so far; a switch that arrived at its surface still has the sign of the side it came from,
-            and one whose side is unknown has 0.
-        - `at`: for each `sgn` switch whether it is at its surface.
-        - `leaves`: for each slidable switch the sign with which its λ just reached its bound, else 0.
-
-        **Returns:** the new state, whether the solution is not unique (a repulsive surface (2.25) met without a side),
-        and whether no valid assignment was found.
-        """
-        self, t, y = frozen((self, t, y))  # modes have no derivative
-        sgns = tuple(at)
-        false = jnp.zeros((), bool)
-        if not sgns:
-            return state, false, false
-        mode = dict(enumerate(state.mode))
-        came = {k: mode[k] for k in sgns}
-
-        def look(mode: dict[int, Any]) -> tuple[dict, dict, dict]:
-            trial = state._replace(mode=tuple(mode.values()))
-            s = self.values(t, y, trial)
-            rates = dict(zip(sgns, self._rates(sgns, t, y, trial, s)))
-            slopes = {k: jnp.zeros((), t.dtype) for k in sgns}
-            if self.slidable:
-                _, matrix = self._linear(t, y, trial, s)
-                slopes |= {k: matrix[i, i] for i, k in enumerate(self.slidable)}
-            return {k: s[k] for k in sgns}, rates, slopes
-
-        # First guess: everything at its surface sticks, unless its surface repels or its value does not act on it.
-        trial = dict(mode)
-        for k in sgns:
-            trial[k] = jnp.where(at[k], 0, mode[k]) if k in self.slidable else mode[k]
-        _, rates, slopes = look(trial)
-        repels = {k: slopes[k] >= 0 for k in sgns}
-        for k in sgns:
-            if k in self.slidable:
-                # A repulsive surface is left to the other side: beyond |λ| = 1 both fields point there.
-                forced = jnp.where(repels[k], -leaves[k], leaves[k])
-                passes = repels[k] & (came[k] != 0)
-                trial[k] = jnp.where(at[k] & (forced != 0), forced, jnp.where(at[k] & passes, -came[k], trial[k]))
-            else:
-                unmoved = jnp.where(came[k] == 0, 1, came[k])
-                side = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
-                # It cannot but cross; at a double root the sign of dh/dt is rounding.
-                side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
-                trial[k] = jnp.where(at[k], side, mode[k])
-        if len(sgns) == 1:
-            trial, wrong = self._amend(sgns, at, leaves, trial, look(trial))[0], false
-        else:
-            # One release or taking back a round, until nothing is violated; so many rounds do for all to change twice.
-            def amend(carry: tuple) -> tuple:
-                count, trial, _ = carry
-                return count + 1, *self._amend(sgns, at, leaves, trial, look(trial))
-
-            def unsettled(carry: tuple) -> Bool[Array, ""]:
-                count, _, wrong = carry
-                return wrong & (count < 2 * len(sgns) + 2)
-
-            trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
-            begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
-            _, trial, wrong = lax.while_loop(unsettled, amend, begin)
-
-        _, rates, slopes = look(trial)
-        roots = list(state.roots)
-        unsure = false
-        for k in sgns:
-            # Leaving with dh/dt = 0 (the end of sliding with b = 1) makes a double root of h at this instant.
-            simple = rates[k] * trial[k].astype(t.dtype) > 1e-10 * jnp.abs(slopes[k])
-            fresh = jnp.where(trial[k] == 0, 0, jnp.where(simple, 1, 2))
-            roots[k] = jnp.where(at[k], fresh, roots[k]).astype(jnp.int32)
-            unsure = unsure | (at[k] & (trial[k] == 0) & (slopes[k] > 0) & (came[k] == 0))
-        state = state._replace(mode=tuple(m.astype(jnp.int32) for m in trial.values()), roots=tuple(roots))
-        return state, unsure, wrong
-
-    def _amend(self, sgns: tuple, at: dict, leaves: dict, trial: dict, seen: tuple) -> tuple[dict, Bool[Array, ""]]:
-        """One release, or one taking back, of the switch that violates its law most."""
-        s, rates, slopes = seen
-        excess, opposed = [], []
-        for k in sgns:
-            loose = at[k] & (trial[k] == 0) if k in self.slidable else jnp.zeros((), bool)
-            excess.append(jnp.where(loose, jnp.abs(s[k]) / (self.bound(k) if k in self.slidable else 1) - 1, -1))
-            free = at[k] & (trial[k] != 0)
-            free = free & (leaves[k] == 0)  # its λ is at the bound (or it crosses): dh/dt may be zero but for rounding
-            against = -rates[k] * trial[k].astype(rates[k].dtype)
-            small = 1e-10 * jnp.abs(slopes[k])
-            opposed.append(jnp.where(free & (against > small), against, 0))
-        worst = jnp.stack(excess)
-        back = jnp.stack(opposed)
-        release = jnp.any(~(worst <= 0))  # a multiplier that is not a number is a violation too
-        retake = ~release & jnp.any(back > 0)
-        out = dict(trial)
-        for i, k in enumerate(sgns):
-            first = release & (jnp.argmax(jnp.where(jnp.isnan(worst), jnp.inf, worst)) == i)
-            again = retake & (jnp.argmax(back) == i)
-            taken = jnp.where(slopes[k] < 0, 0, -trial[k])
-            side = jnp.where((s[k] >= 0) == (slopes[k] < 0), 1, -1)  # where dh/dt = slope (s - λ) points
-            out[k] = jnp.where(first, side, jnp.where(again, taken, trial[k])).astype(jnp.int32)
-        return out, release | retake

@@ -1,14 +1,14 @@
 """Saltation matrices from their formula, an oracle independent of automatic differentiation through the flow."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ._event import rebound
+from ._event import completed, rebound
 from ._filippov import Model, State
 from ._solution import Events
 from ._system import arrays_of, impact, relay, System
@@ -56,16 +56,32 @@ def _fired(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
         return jnp.where(mode == 1, switch.off_guard(model.system, t, y), on)
     h = model.h(k, t, y)
     surface = h[0] if len(h) == 1 else jnp.stack(h)[state.part[k]]
-    if k not in model.slidable:
+    if k not in model.holdable:
         return surface
     lam = model.values(t, y, state)[k]
-    return jnp.where(mode == 0, model.bound(k) - jnp.sign(lam) * lam, surface)
+    left = lam if k in model.contacts else model.bound(k) - jnp.sign(lam) * lam
+    return jnp.where(model.held(k, mode), left, surface)
 
 
-def _pieces(
-    model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple
-) -> tuple[Float[Array, " n"], Scalar, Float[Array, " n"], Float[Array, "n n"], Float[Array, " n"], Float[Array, " n"]]:
-    """n, h_t, f⁻, D R, R_t and f⁺ at an event of switch k; R is the identity but for impacts."""
+class _Jump(NamedTuple):
+    """An event of one switch, linearised; R is the identity but for impacts."""
+
+    n: Float[Array, " n"]
+    h_t: Scalar
+    f_before: Float[Array, " n"]
+    f_after: Float[Array, " n"]
+    dr: Float[Array, "n n"]  # of R, with respect to the state
+    r_t: Float[Array, " n"]
+    drest: Float[Array, " n"]  # of the time that the impacts up to the state of rest take
+    rest_t: Scalar
+    onto: Float[Array, "n n"]  # the linearised constraints of resting contact
+
+    @property
+    def rate(self) -> Scalar:
+        return self.n @ self.f_before + self.h_t
+
+
+def _jump(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> _Jump:
     flat, unravel = jfu.ravel_pytree(y)
 
     def ravel(y: Y) -> Array:
@@ -74,19 +90,40 @@ def _pieces(
     state = _states(model, t, y, before)
     h_t, n = jax.jacfwd(lambda t, x: _fired(model, k, t, unravel(x), state), argnums=(0, 1))(t, flat)
     f_before = ravel(model.flow(t, y, state))
+    zero, eye = jnp.zeros_like(flat), jnp.eye(flat.size, dtype=flat.dtype)
+    stays = (zero, eye, jnp.zeros_like(t), zero, flat, eye)
+    r_t, dr, rest_t, drest, landed, onto = stays
     if isinstance(model.switches[k], impact):
-        jump = lambda t, x: ravel(rebound(model, k, t, unravel(x), state))  # noqa: E731
-        r_t, dr = jax.jacfwd(jump, argnums=(0, 1))(t, flat)
-        landed = unravel(jump(t, flat))
-    else:
-        r_t, dr, landed = jnp.zeros_like(flat), jnp.eye(flat.size, dtype=flat.dtype), y
-    f_after = ravel(model.flow(t, landed, _states(model, t, landed, after)))
-    return n, h_t, f_before, dr, r_t, f_after
+        free = jnp.zeros_like(before[k])
+        rests = after[k] == 1
+
+        def held(t: Scalar, x: Array) -> Array:
+            return ravel(model.project(t, unravel(x), _states(model, t, unravel(x), after)))
+
+        def hit(t: Scalar, x: Array) -> tuple[Array, Scalar]:
+            y = unravel(x)
+            bounced = rebound(model, k, t, y, state)
+            flight = _states(model, t, bounced, after[:k] + (free,) + after[k + 1 :])
+            end = completed(model, k, t, y, bounced, state, flight)
+            rest = jnp.where(rests, end.rest, 0)
+            return jnp.where(rests, held(t + rest, ravel(end.y)), ravel(bounced)), rest
+
+        (r_t, dr), (rest_t, drest) = jax.jacfwd(hit, argnums=(0, 1))(t, flat)
+        landed, rest = hit(t, flat)
+        onto = jnp.where(rests, jax.jacfwd(lambda x: held(t + rest, x))(landed), eye)
+        jumps = (r_t, dr, rest_t, drest, landed, onto)
+        # To lift off is no jump.
+        lands = before[k] == 0
+        r_t, dr, rest_t, drest, landed, onto = jax.tree.map(lambda a, b: jnp.where(lands, a, b), jumps, stays)
+    f_after = ravel(model.flow(t, unravel(landed), _states(model, t, unravel(landed), after)))
+    return _Jump(n, h_t, f_before, f_after, dr, r_t, drest, rest_t, onto)
 
 
 def _matrix(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Float[Array, "n n"]:
-    n, h_t, f_before, dr, r_t, f_after = _pieces(model, t, y, k, before, after)
-    return dr + jnp.outer(f_after - dr @ f_before - r_t, n) / (n @ f_before + h_t)
+    j = _jump(model, t, y, k, before, after)
+    late = 1 + j.drest @ j.f_before + j.rest_t  # how much later the state of rest begins when the impact does
+    turn = j.f_after * late - j.dr @ j.f_before - j.r_t
+    return j.onto @ (j.dr - jnp.outer(j.f_after, j.drest) + jnp.outer(turn, j.n) / j.rate)
 
 
 def saltation_matrix(
@@ -95,7 +132,8 @@ def saltation_matrix(
     """The saltation matrix of an event, by which the fundamental matrix jumps: Φ(t+) = S Φ(t-).
 
     S = DR + (f⁺ - DR f⁻ - R_t) nᵀ / (nᵀ f⁻ + h_t), with n = grad h: eq. (3.30) where the state does not jump (R = y)
-    and h does not depend on time, (3.32) where it does. At a tangency the denominator vanishes and S is infinite.
+    and h does not depend on time, (3.32) where it does. At a tangency the denominator vanishes and S is infinite. For
+    an impact into resting contact R sums all impacts up to the accumulation point, whose time varies with the state.
 
     **Arguments:**
 
@@ -143,7 +181,8 @@ def transversality(system: System, events: Events) -> Float[Array, " events"]:
     exist) to 1; rows past the last event are NaN."""
 
     def cosine(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Scalar:
-        n, h_t, f, *_ = _pieces(model, t, y, k, before, after)
-        return jnp.abs(n @ f + h_t) / jnp.sqrt((n @ n + h_t**2) * (f @ f + jnp.where(h_t == 0, 0, 1)))
+        j = _jump(model, t, y, k, before, after)
+        size = (j.n @ j.n + j.h_t**2) * (j.f_before @ j.f_before + jnp.where(j.h_t == 0, 0, 1))
+        return jnp.abs(j.rate) / jnp.sqrt(size)
 
     return _over_log(system, events, cosine)

@@ -23,8 +23,9 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "`sol.events`."
     )
     accumulation_reached = (
-        "Impacts accumulated (Zeno): infinitely many in a finite time. `sol.t1` and `sol.y1` hold the time and the "
-        "state at the accumulation point, where contact begins to last."
+        "Impacts accumulated (Zeno): infinitely many in a finite time, on a surface that cannot hold the solution (its "
+        "h is a tuple, or the contact force does not occur in `vector_field`). `sol.t1` and `sol.y1` hold the time "
+        "and the state at the accumulation point."
     )
     repulsive_sliding = (
         "The start lies on a surface which both fields leave (2.25): the solution is not unique. Choose one by "
@@ -75,7 +76,8 @@ class Events(eqx.Module):
 
     - `t`: times, shape `(max_events,)`.
     - `switch`: which switch, as its position in `names`.
-    - `mode_before`, `mode_after`: shape `(max_events, number of switches)`; for `sgn` +1, -1, or 0 while sliding.
+    - `mode_before`, `mode_after`: shape `(max_events, number of switches)`; for `sgn` +1, -1, or 0
+      while sliding; `relay` 0 or 1; `impact` 1 while resting in contact.
     - `y_before`, `y_after`: the state on either side, leaves with a leading axis of length `max_events`.
     - `num`: how many there were.
     """

@@ -197,7 +197,13 @@ class _Flow(eqx.Module):
             log_it = event & there.news
             assert log is not None
             log = log.write(
-                events, log_it, there.t * model.direction, there.y_before, there.y_after, there.slot, there.state.mode
+                events,
+                log_it,
+                there.t_after * model.direction,
+                there.y_before,
+                there.y_after,
+                there.slot,
+                there.state.mode,
             )
             events = events + log_it.astype(jnp.int32)
             halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(keep, 0, halted))
@@ -269,7 +275,7 @@ def _survey(coefficients: list, known: list) -> tuple[Bool[Array, ""], Bool[Arra
     positive in all coefficients but those which vanish with its known roots."""
 
     def least(c: list[Scalar], roots: Int[Array, ""]) -> Scalar:
-        return ft.reduce(jnp.minimum, [jnp.where(j < roots, 1, x) if j < 2 else x for j, x in enumerate(c)])
+        return ft.reduce(jnp.minimum, [jnp.where(j < roots, 1, x) if j < 3 else x for j, x in enumerate(c)])
 
     rows = [ft.reduce(jnp.maximum, map(least, row, roots)) for row, roots in zip(coefficients, known)]
     return _finite(coefficients), once(ft.reduce(jnp.minimum, rows)) > 0
@@ -312,6 +318,18 @@ def _run(
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
     model = Model(system, direction, start, y0)
+    for k in model.contacts:
+        zeros = tuple(jnp.zeros_like(t0) for _ in model.switches)
+        unit = tuple(jnp.where(i == k, 1, zero) for i, zero in enumerate(zeros))
+        blank = State((), (None,) * len(zeros), ())
+        force = model.rates((k,), start, y0, blank, unit)[0] - model.rates((k,), start, y0, blank, zeros)[0]
+        name = model.switches[k].name
+        start = eqx.error_if(
+            start,
+            force < 0,
+            f"`{type(system).__name__}.vector_field` must contain `s.{name}` with the sign with which a contact force "
+            f"s.{name} >= 0 opens the gap `{name}`, but it closes it. Change its sign.",
+        )
     stepper = Stepper(solver)
     max_events = max_events if model.slots else 0
     state, result = start_mode(model, start, y0, given)
@@ -450,9 +468,9 @@ def solve(
     """Solves y' = f(t, y, s), s_k in Sgn(h_k(t, y)), from `t0` to `t1` (which may lie before it), event by event.
 
     Between events the field is smooth and `solver` steps it; every event is located to the accuracy of the method;
-    after it the solution crosses, slides (2.19), sticks, switches or rebounds. Derivatives by `jax.jvp` / `jax.jacfwd`
-    with respect to `y0`, `t0`, `t1` and the parameters of `system` are those of the flow, saltation (3.30) included;
-    so are those of event times.
+    after it the solution crosses, slides (2.19), sticks, switches, rebounds or rests. Derivatives by `jax.jvp` and
+    `jax.jacfwd` with respect to `y0`, `t0`, `t1` and the parameters of `system` are those of the flow, saltation (3.30)
+    included; so are those of event times.
 
     **Arguments:**
 
@@ -460,7 +478,8 @@ def solve(
     - `t0`, `t1`: start and end [time].
     - `y0`: the state at `t0`, any pytree of floating point arrays of one dtype.
     - `mode`: for a start on a surface, `{"name": value}` or one value for each switch: `sgn` +1, -1, or 0 to slide
-        (also on a repulsive surface); `relay` 0 or 1 (needed between its two surfaces, 0 by default).
+        (also on a repulsive surface); `relay` 0 or 1 (needed between its two surfaces, 0 by default); `impact` 0 or 1
+        to rest.
     - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, or Euler.
     - `stepsize_controller`: by default `diffrax.PIDController` with `rtol = atol = 1e-8` (1e-5 for float32).
     - `saveat`: as in diffrax: `t0`, `t1`, `ts`, `steps`, `fn(t, y, system)`, `dense`.

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from ._filippov import Model, State
+from ._settle import settle
 from ._solution import RESULTS
 from ._system import impact, relay
 from ._types import Scalar, Y
@@ -34,8 +35,22 @@ def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[St
         parts.append(part.astype(jnp.int32) if model.parts[k] > 1 else None)
         roots.append(zero)
         if isinstance(switch, impact):
-            modes.append(zero)
-            result = RESULTS.where(h < -noise, RESULTS.wrong_mode, result)
+            wrong = h < -noise
+            rests = jnp.zeros((), bool)
+            if switch.name in given:
+                if k not in model.contacts:
+                    raise ValueError(
+                        f"Argument `mode` must not name `{switch.name}`: this impact surface cannot hold the solution "
+                        f"(it is a minimum, or `s.{switch.name}` is not a force that acts on d²h/dt²)."
+                    )
+                at[k], rests = rests, jnp.asarray(given[switch.name]) == 1
+                wrong = wrong | (rests & (h > 1e6 * noise))
+            elif k in model.contacts:
+                still = State((), tuple(parts), ())
+                (slow,) = model.rounding(lambda t, y, k=k, still=still: (model.level(k, t, y, still),), t, y)
+                at[k] = rests = on[k] & (jnp.abs(model.level(k, t, y, still)) <= slow)
+            modes.append(rests.astype(jnp.int32))
+            result = RESULTS.where(wrong, RESULTS.wrong_mode, result)
         elif switch.name in given:
             mode = jnp.asarray(given[switch.name], jnp.int32)
             # A state taken from an earlier solution may carry some drift off its surface.
@@ -48,15 +63,15 @@ def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[St
             modes.append(jnp.where(on[k], 0, jnp.sign(h)).astype(jnp.int32))
             at[k] = on[k]
     state = State(tuple(modes), tuple(parts), tuple(roots))
-    state, unsure, wrong = model.settle(t, y, state, at, {k: jnp.zeros((), jnp.int32) for k in at})
+    state, unsure, wrong = settle(model, t, y, state, at, {k: jnp.zeros((), jnp.int32) for k in at})
     result = RESULTS.where(unsure, RESULTS.repulsive_sliding, result)
     result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
     # Guards of surfaces on which the start lies have a root there already.
     roots = list(state.roots)
     s = model.values(t, y, state)
     for k, here in on.items():
-        rate = model._rates((k,), t, y, state, s)[0]
-        sign = jnp.where(jnp.asarray(isinstance(model.switches[k], impact)), 1, state.mode[k])
+        rate = model.approach(k, t, y, state)
+        sign = 1 - state.mode[k] if isinstance(model.switches[k], impact) else state.mode[k]
         scale = jnp.sqrt(jnp.finfo(t.dtype).eps) * _size(model, k, t, y, state, s)
         fresh = jnp.where(jnp.abs(rate) > scale, 1, 2)
         settled = at.get(k, jnp.zeros((), bool))

@@ -125,8 +125,10 @@ class impact(AbstractSwitch):
     ```
 
     With `restitution` the impulse acts along ∂f/∂s, the direction in which the contact force enters the equations of
-    motion, so `vector_field` must contain it: `v' = -g + s.floor / m`. Between impacts the value `s.floor` is 0.
-    With `@floor.reset`, `y_after = reset(self, t, y_before)` is the user's own.
+    motion, so `vector_field` must contain it: `v' = -g + s.floor / m`. Between impacts the value `s.floor` is 0. Where
+    impacts accumulate (at once if e = 0) the solution comes to rest on the surface: `s.floor` >= 0 is the force that
+    keeps it there, and when it has fallen to zero the solution lifts off. (A tuple-valued h has no such state: impacts
+    that accumulate end the solution.) With `@floor.reset`, `y_after = reset(self, t, y_before)` is the user's own.
     """
 
     reset_fn: Guard = None

@@ -123,15 +123,6 @@ def test_ball_does_not_fall_through_the_floor():
     assert np.all(np.asarray(sol.events.y_after.x)[: len(sol.events)] > -1e-15)
 
 
-def test_impacts_that_accumulate():
-    """Pitfall 16: infinitely many impacts end with a status of their own at the closed form's time and state."""
-    exact = reference.bouncing_ball(0.1, e=0.6, v0=0.5).accumulation
-    sol = solve(gallery.BouncingBall(e=0.6), 0.0, 10.0, Motion(1.0, 0.5), throw=False)
-    assert sol.result == RESULTS.accumulation_reached
-    np.testing.assert_allclose(sol.t1, exact, rtol=1e-12)
-    np.testing.assert_allclose(flat(sol.y1), [0, 0], atol=1e-12)
-
-
 def relay_times(p, T, t1):
     """Switching times of the thermostat from below T_high, on."""
     t, on, out = 0.0, True, []

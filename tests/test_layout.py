@@ -23,6 +23,7 @@ ORDER = (
     "_step",
     "_solution",
     "_save",
+    "_settle",
     "_event",
     "_check",
     "_start",

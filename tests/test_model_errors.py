@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import Hammer, Heat, Motion, Plane, Point, Thermostat
+from models import Heat, Motion, Plane, Point, Thermostat
 
 import nsjax
 from nsjax import gallery, RESULTS, saltation_matrix, solve
@@ -223,11 +223,6 @@ ARGUMENTS = {
         dict(system=Thermostat(), y0=Heat(20.0), mode={"heater": -1}),
         ValueError,
         r"must give `heater` one of \(0, 1\)",
-    ),
-    "mode: impact": (
-        dict(system=Hammer(), mode={"wall": 0}),
-        ValueError,
-        "must not name `wall`: an impact surface has no",
     ),
 }
 

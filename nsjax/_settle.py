@@ -1,0 +1,164 @@
+"""The choice of mode where switches are at their surfaces."""
+
+from typing import Any
+
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from ._filippov import Model, State
+from ._system import frozen
+from ._types import Scalar, Y
+
+
+def settle(
+    model: Model,
+    t: Scalar,
+    y: Y,
+    state: State,
+    at: dict[int, Bool[Array, ""]],
+    leaves: dict[int, Int[Array, ""]],
+) -> tuple[State, Bool[Array, ""], Bool[Array, ""]]:
+    """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}, every contact one from {1, 0}.
+
+    All of them hold if that is valid (|λ| <= b, a contact force λ >= 0). Otherwise the one that violates its law most
+    is released, to the sign of its λ, and a released switch whose motion then opposes this is taken back, until nothing
+    is violated.
+
+    **Arguments:**
+
+    - `state`: the mode so far; a `sgn` switch that arrived at its surface still has the sign of the side it came from,
+        and one whose side is unknown has 0.
+    - `at`: for each `sgn` switch whether it is at its surface, for each contact whether it rests there (dh/dt = 0).
+    - `leaves`: for each switch the sign with which its λ just reached its bound, else 0.
+
+    **Returns:** the new state, whether the solution is not unique (a repulsive surface (2.25) met without a side), and
+    whether no valid assignment was found.
+    """
+    model, t, y = frozen((model, t, y))  # modes have no derivative
+    which = tuple(at)
+    false = jnp.zeros((), bool)
+    if not which:
+        return state, false, false
+    mode = dict(enumerate(state.mode))
+    came = {k: mode[k] for k in which}
+
+    def look(mode: dict[int, Any]) -> tuple[dict, dict, dict]:
+        trial = state._replace(mode=tuple(mode.values()))
+        s = model.values(t, y, trial)
+        rates = dict(zip(which, model.rates(which, t, y, trial, s)))
+        slopes = {k: jnp.zeros((), t.dtype) for k in which}
+        if model.holdable:
+            _, matrix = model.linear(t, y, trial, s)
+            slopes |= {k: matrix[i, i] for i, k in enumerate(model.holdable)}
+        return {k: s[k] for k in which}, rates, slopes
+
+    # First guess: everything at its surface is held, unless its surface repels or its value does not act on it.
+    trial = dict(mode)
+    for k in which:
+        if k in model.contacts:
+            trial[k] = jnp.where(at[k], jnp.where(leaves[k] != 0, 0, 1), mode[k])
+        elif k in model.holdable:
+            trial[k] = jnp.where(at[k], 0, mode[k])
+    _, rates, slopes = look(trial)
+    repels = {k: slopes[k] >= 0 for k in which}
+    for k in which:
+        if k in model.contacts:
+            continue
+        if k in model.holdable:
+            # A repulsive surface is left to the other side: beyond |λ| = 1 both fields point there.
+            forced = jnp.where(repels[k], -leaves[k], leaves[k])
+            passes = repels[k] & (came[k] != 0)
+            trial[k] = jnp.where(at[k] & (forced != 0), forced, jnp.where(at[k] & passes, -came[k], trial[k]))
+        else:
+            unmoved = jnp.where(came[k] == 0, 1, came[k])
+            side = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
+            # It cannot but cross; at a double root the sign of dh/dt is rounding.
+            side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
+            trial[k] = jnp.where(at[k], side, mode[k])
+    if len(which) == 1:
+        trial, wrong = _amend(model, which, at, leaves, trial, look(trial))[0], false
+    else:
+        # One release or taking back a round, until nothing is violated; so many rounds do for all to change twice.
+        def amend(carry: tuple) -> tuple:
+            count, trial, _ = carry
+            return count + 1, *_amend(model, which, at, leaves, trial, look(trial))
+
+        def unsettled(carry: tuple) -> Bool[Array, ""]:
+            count, _, wrong = carry
+            return wrong & (count < 2 * len(which) + 2)
+
+        trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
+        begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
+        _, trial, wrong = lax.while_loop(unsettled, amend, begin)
+
+    _, rates, slopes = look(trial)
+    if model.contacts and len(model.holdable) > 1:
+        trial = _pinned(model, t, y, state, at, trial, rates)
+    roots = list(state.roots)
+    unsure = false
+    for k in which:
+        if k in model.contacts:
+            # It lifts off with h = dh/dt = 0, and where its force has reached zero d²h/dt² = 0 too.
+            fresh = jnp.where(trial[k] == 1, 0, jnp.where(leaves[k] != 0, 3, 2))
+        else:
+            # Leaving with dh/dt = 0 (the end of sliding with b = 1) makes a double root of h at this instant.
+            simple = rates[k] * trial[k].astype(t.dtype) > 1e-10 * jnp.abs(slopes[k])
+            fresh = jnp.where(trial[k] == 0, 0, jnp.where(simple, 1, 2))
+            unsure = unsure | (at[k] & (trial[k] == 0) & (slopes[k] > 0) & (came[k] == 0))
+        roots[k] = jnp.where(at[k], fresh, roots[k]).astype(jnp.int32)
+    state = state._replace(mode=tuple(m.astype(jnp.int32) for m in trial.values()), roots=tuple(roots))
+    return state, unsure, wrong
+
+
+def _pinned(model: Model, t: Scalar, y: Y, state: State, at: dict, trial: dict, rates: dict) -> dict:
+    """A `sgn` switch at its surface that a contact keeps there, whatever its own value, is neither side's."""
+    held = state._replace(mode=tuple(trial.values()))
+    s = model.values(t, y, held)
+    _, matrix = model.linear(t, y, held, s)
+    out = dict(trial)
+    for i, k in enumerate(model.holdable):
+        if k in model.contacts:
+            continue
+        pull = sum(
+            jnp.where(at[c] & (trial[c] == 1), jnp.abs(matrix[i, j] * s[c]), 0)
+            for j, c in enumerate(model.holdable)
+            if c in model.contacts
+        )
+        pinned = at[k] & (pull > 0) & (jnp.abs(rates[k]) <= 1e-10 * pull)
+        out[k] = jnp.where(pinned, 0, trial[k]).astype(jnp.int32)
+    return out
+
+
+def _amend(
+    model: Model, which: tuple, at: dict, leaves: dict, trial: dict, seen: tuple
+) -> tuple[dict, Bool[Array, ""]]:
+    """One release, or one taking back, of the switch that violates its law most."""
+    s, rates, slopes = seen
+    excess, opposed = [], []
+    for k in which:
+        held = at[k] & model.held(k, trial[k]) if k in model.holdable else jnp.zeros((), bool)
+        if k in model.contacts:
+            over, against = -s[k] * slopes[k], -rates[k]
+        else:
+            over = jnp.abs(s[k]) / (model.bound(k) if k in model.holdable else 1) - 1
+            against = -rates[k] * trial[k].astype(rates[k].dtype)
+        excess.append(jnp.where(held, over, -1))
+        # What has just left has its λ at the bound (or it crosses): dh/dt may be zero but for rounding.
+        free = at[k] & ~held & (trial[k] != 0 if k not in model.contacts else True) & (leaves[k] == 0)
+        opposed.append(jnp.where(free & (against > 1e-10 * jnp.abs(slopes[k])), against, 0))
+    worst = jnp.stack(excess)
+    back = jnp.stack(opposed)
+    release = jnp.any(~(worst <= 0))  # a multiplier that is not a number is a violation too
+    retake = ~release & jnp.any(back > 0)
+    out = dict(trial)
+    for i, k in enumerate(which):
+        first = release & (jnp.argmax(jnp.where(jnp.isnan(worst), jnp.inf, worst)) == i)
+        again = retake & (jnp.argmax(back) == i)
+        if k in model.contacts:
+            side, taken = 0, 1
+        else:
+            taken = jnp.where(slopes[k] < 0, 0, -trial[k])
+            side = jnp.where((s[k] >= 0) == (slopes[k] < 0), 1, -1)  # where dh/dt = slope (s - λ) points
+        out[k] = jnp.where(first, side, jnp.where(again, taken, trial[k])).astype(jnp.int32)
+    return out, release | retake

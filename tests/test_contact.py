@@ -1,0 +1,239 @@
+"""Impacts to the end: accumulation, rest, sliding with the contact's own force, lift-off."""
+
+from typing import NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array
+from models import flat, Motion, pid
+
+import nsjax
+from nsjax import gallery, RESULTS, solve
+
+
+Ball = gallery.BouncingBall
+TIGHT = dict(solver=dfx.Dopri8(), stepsize_controller=pid(1e-12))
+
+
+def accumulation(e, g, x):
+    return jnp.sqrt(2 * x / g) * (1 + e) / (1 - e)
+
+
+def last_event(sol):
+    return sol.events.t[sol.events.num - 1]
+
+
+def test_ball_comes_to_rest():
+    """Pitfall 16: infinitely many impacts lead to rest at the closed form's time; the derivative goes through them."""
+
+    def at_rest(e, g, x):
+        return last_event(solve(Ball(e=e, g=g), 0.0, 5.0, Motion(x, jnp.zeros_like(x))))
+
+    parameters = (0.8, 9.81, 1.0)
+    np.testing.assert_allclose(at_rest(*map(jnp.asarray, parameters)), accumulation(*parameters), rtol=1e-12)
+    derivative = jax.jacfwd(at_rest, argnums=(0, 1, 2))(*map(jnp.asarray, parameters))
+    np.testing.assert_allclose(derivative, jax.grad(accumulation, argnums=(0, 1, 2))(*parameters), rtol=1e-8)
+
+
+def test_ball_that_hardly_loses_speed():
+    """Pitfall 16: eleven thousand impacts before the rest."""
+    sol = solve(Ball(e=0.999), 0.0, 1000.0, Motion(1.0, 0.0), max_steps=40_000, max_events=12_000, solver=dfx.Dopri8())
+    np.testing.assert_allclose(last_event(sol), accumulation(0.999, 9.81, 1.0), atol=1e-9)
+    assert sol.mode1 == 1 and np.all(flat(sol.y1) == 0)
+
+
+@pytest.mark.parametrize("x", [0.0, 1.0])
+def test_plastic_impact(x):
+    """Pitfalls 2, 16: e = 0 rests at the first impact; who starts at rest has none."""
+    sol = solve(Ball(e=0.0), 0.0, 5.0, Motion(x, 0.0))
+    assert len(sol.events) == (x > 0) and sol.mode1 == 1
+    np.testing.assert_allclose(sol.events.t[:1], np.sqrt(2 * x / 9.81) if x else np.inf, rtol=1e-12)
+    np.testing.assert_allclose(flat(sol.y1), 0, atol=1e-15)
+
+
+class Rising(nsjax.System):
+    """A mass on the floor, pulled by a force that grows: lifts off at t = m g / r."""
+
+    m: float = 2.0
+    g: float = 9.81
+    r: float = 10.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -self.g + (self.r * t + s.floor) / self.m)
+
+    @nsjax.impact
+    def floor(self, t, y):
+        return y.x
+
+    @floor.restitution
+    def floor(self):
+        return 0.5
+
+
+def test_lift_off():
+    """Where the contact force vanishes h, dh/dt and d²h/dt² are all zero: no false impact on the next step."""
+    p, t1 = Rising(), 3.0
+    start = p.m * p.g / p.r
+    sol = solve(p, 0.0, t1, Motion(0.0, 0.0), **TIGHT)
+    assert len(sol.events) == 1 and sol.events[0].mode_after == {"floor": 0}
+    np.testing.assert_allclose(last_event(sol), start, rtol=1e-12)
+    free = t1 - start
+    np.testing.assert_allclose(flat(sol.y1), [p.r / p.m * free**3 / 6, p.r / p.m * free**2 / 2], rtol=1e-11)
+    derivative = jax.jacfwd(lambda g: jnp.stack(solve(Rising(g=g), 0.0, t1, Motion(0.0, 0.0), **TIGHT).y1))(p.g)
+    np.testing.assert_allclose(derivative, [-(free**2) / 2, -free], rtol=1e-9)
+
+
+class Thrown(NamedTuple):
+    x: Array
+    z: Array
+    u: Array
+    v: Array
+
+
+class Block(nsjax.System):
+    """Thrown onto a floor with Coulomb friction: the contact force times the friction's sign, multi-affine."""
+
+    mu: float = 0.3
+    g: float = 9.81
+    e: float = 0.5
+
+    def vector_field(self, t, y, s):
+        return Thrown(y.u, y.v, -self.mu * s.floor * s.slide, -self.g + s.floor)
+
+    @nsjax.impact
+    def floor(self, t, y):
+        return y.z
+
+    @floor.restitution
+    def floor(self):
+        return self.e
+
+    @nsjax.sgn
+    def slide(self, t, y):
+        return y.u
+
+
+def block(p, u, z):
+    """Times of rest and of sticking, final x: friction takes its share μ of every impulse, then of the weight."""
+    fall, speeds = np.sqrt(2 * z / p.g), []
+    v, x = p.g * fall, u * fall
+    while v > 1e-17:
+        u, v = u - p.mu * (1 + p.e) * v, p.e * v
+        speeds.append(u)
+        x += u * 2 * v / p.g
+    rest = accumulation(p.e, p.g, z)
+    return rest, rest + u / (p.mu * p.g), x + u**2 / (2 * p.mu * p.g)
+
+
+def test_friction_by_the_contact_force():
+    """Contact together with friction on another coordinate: bounces, rests, slides, sticks."""
+    p, u, z = Block(), 5.0, 0.5
+    rest, stop, x = block(p, u, z)
+    sol = solve(p, 0.0, 5.0, Thrown(0.0, z, u, 0.0), **TIGHT)
+    modes = [tuple(e.mode_after.values()) for e in sol.events]
+    assert modes[-2:] == [(1, 1), (1, 0)] and set(modes[:-2]) == {(0, 1)}
+    np.testing.assert_allclose(sol.events.t[len(sol.events) - 2 : len(sol.events)], [rest, stop], rtol=1e-10)
+    np.testing.assert_allclose(flat(sol.y1), [x, 0, 0, 0], atol=1e-10)
+    # The impulse of friction ends the sliding, it does not turn it round.
+    slow = solve(p, 0.0, 5.0, Thrown(0.0, z, 1.0, 0.0), **TIGHT)
+    assert np.all(np.abs(slow.events.y_after.u[: len(slow.events)]) < 1e-15)
+    np.testing.assert_allclose(slow.y1.x, np.sqrt(2 * z / p.g), rtol=1e-12)
+
+
+def test_fundamental_matrix_through_rest():
+    """Two routes, while it slides at rest and after it sticks."""
+    y0, ts = Thrown(0.0, 0.5, 5.0, 0.0), jnp.array([1.2, 5.0])
+    formula = nsjax.fundamental_matrix(Block(), 0.0, 5.0, y0, ts=ts)
+    autodiff = nsjax.fundamental_matrix(Block(), 0.0, 5.0, y0, ts=ts, method="autodiff")
+    np.testing.assert_allclose(formula, autodiff, atol=1e-6)
+    np.testing.assert_allclose(autodiff[:, 1::2], 0, atol=1e-12)  # z and its rate are known
+    d = 1e-6
+    x = [block(Block(), 5.0 + a, 0.5 + b)[2] for a, b in [(0, d), (0, -d), (d, 0), (-d, 0)]]
+    np.testing.assert_allclose(autodiff[1, 0, :3], [1, (x[0] - x[1]) / 2 / d, (x[2] - x[3]) / 2 / d], rtol=1e-6)
+    np.testing.assert_allclose(autodiff[1, 2], 0, atol=1e-12)
+
+
+class Stack(nsjax.System):
+    """Two balls above each other on a floor."""
+
+    e: float = 0.0
+    m: float = 2.0  # of the upper one; the lower one has 1
+    g: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Thrown(y.u, y.v, -self.g + s.floor - s.between, -self.g + s.between / self.m)
+
+    @nsjax.impact
+    def floor(self, t, y):
+        return y.x
+
+    @nsjax.impact
+    def between(self, t, y):
+        return y.z - y.x
+
+    @floor.restitution
+    def floor(self):
+        return self.e
+
+    @between.restitution
+    def between(self):
+        return self.e
+
+
+def test_two_contacts():
+    """The lower ball lands and rests, then the upper one on it; both stay, without drift."""
+    sol = solve(Stack(), 0.0, 1000.0, Thrown(0.5, 1.0, 0.0, 0.0), **TIGHT)
+    assert [tuple(e.mode_after.values()) for e in sol.events] == [(1, 0), (1, 1)]
+    np.testing.assert_allclose(sol.events.t[:2], [1.0, np.sqrt(2)], rtol=1e-12)
+    np.testing.assert_allclose(flat(sol.y1), 0, atol=1e-14)
+
+
+def test_accumulation_on_a_corner_is_told():
+    """Two walls in one switch cannot be rested upon."""
+
+    class Corner(Ball):
+        @nsjax.impact
+        def floor(self, t, y):
+            return y.x, 10.0 + y.x
+
+        @floor.restitution
+        def floor(self):
+            return self.e
+
+    sol = solve(Corner(e=0.6), 0.0, 10.0, Motion(1.0, 0.0), throw=False)
+    assert sol.result == RESULTS.accumulation_reached
+    np.testing.assert_allclose(sol.t1, accumulation(0.6, 9.81, 1.0), rtol=1e-12)
+    np.testing.assert_allclose(flat(sol.y1), 0, atol=1e-12)
+
+
+def test_start_by_mode():
+    """`mode=` sets out at rest or free; a surface that cannot hold is refused, and so is a force that pulls."""
+    free = solve(Rising(), 0.0, 0.5, Motion(0.0, 0.0), mode={"floor": 1})
+    assert free.mode1 == 1
+    lifted = solve(Rising(), 0.0, 0.1, Motion(1.0, 0.0), mode={"floor": 1}, throw=False)
+    assert lifted.result == RESULTS.wrong_mode
+
+    class Jumper(nsjax.System):
+        def vector_field(self, t, y, s):
+            return Motion(y.v, -1.0 + 0 * y.x)
+
+        @nsjax.impact
+        def floor(self, t, y):
+            return y.x
+
+        @floor.reset
+        def floor(self, t, y):
+            return Motion(y.x, -0.5 * y.v)
+
+    with pytest.raises(ValueError, match="cannot hold"):
+        solve(Jumper(), 0.0, 1.0, Motion(1.0, 0.0), mode={"floor": 1})
+
+    class Glue(Rising):
+        def vector_field(self, t, y, s):
+            return Motion(y.v, -self.g - s.floor / self.m)
+
+    with pytest.raises(Exception, match="opens the gap"):
+        solve(Glue(), 0.0, 1.0, Motion(1.0, 0.0))
