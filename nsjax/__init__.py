@@ -5,9 +5,8 @@ from ._orbit import find_orbit as find_orbit, Orbit as Orbit
 from ._saltation import (
     saltation_matrices as saltation_matrices,
     saltation_matrix as saltation_matrix,
-    transversality as transversality,
 )
-from ._solution import Event as Event, Events as Events, RESULTS as RESULTS, Solution as Solution
+from ._solution import Event as Event, Events as Events, is_okay as is_okay, RESULTS as RESULTS, Solution as Solution
 from ._solve import solve as solve
 from ._system import impact as impact, relay as relay, sgn as sgn, System as System
 from ._variational import fundamental_matrix as fundamental_matrix

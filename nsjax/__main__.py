@@ -13,7 +13,7 @@ import jax
 from . import gallery
 from ._cli import draw, Job, load, options, orbit_record, record, report, simulation_record, UsageError
 from ._orbit import find_orbit, Orbit
-from ._solution import RESULTS, Solution
+from ._solution import is_okay, RESULTS, Solution
 from ._solve import solve
 
 
@@ -148,14 +148,14 @@ def _run(args: argparse.Namespace) -> int:
     orbit, trouble = None, None
     if job.guess is not None:
         orbit, trouble = _find(args, job, job.guess.y0, t0, None)
-    elif sol.result == RESULTS.successful and (args.period is not None or not job.from_gallery):
+    elif is_okay(sol.result) and (args.period is not None or not job.from_gallery):
         orbit, trouble = _find(args, job, job.y0, t0, _mode(args, job))
     files = draw(job, sol, orbit, args.out)
     out = sys.stderr if args.json == "-" else sys.stdout
     print(report(job, sol, orbit, trouble), *("", *map(str, files)), sep="\n", file=out)
     numbers = {"simulation": simulation_record(sol), "orbit": None if orbit is None else orbit_record(orbit)}
     _write_json(args.json, record(job, **numbers))
-    return 0 if sol.result == RESULTS.successful or sol.result == RESULTS.accumulation_reached else FAILURE
+    return 0 if is_okay(sol.result) or sol.result == RESULTS.accumulation_reached else FAILURE
 
 
 def _orbit(args: argparse.Namespace) -> int:

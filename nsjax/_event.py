@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -31,6 +32,8 @@ class Landing(NamedTuple):
     slot: Int[Array, ""]
     news: Bool[Array, ""]  # whether anything changed, so that it belongs into the log
     points: Y | None  # control points of the step to the event, if asked for
+    transversality: Scalar
+    grazes: Bool[Array, ""]  # whether it was so tangential that it has no derivative
     result: RESULTS
 
 
@@ -294,9 +297,33 @@ def land(
         news = news | (state_after.mode[k] != state.mode[k])
         if isinstance(switch, impact):
             news = news | fired[k]
+    cosine, bend = transversality(model, te, before, state, slot, part)
+    grazes = found & news & ~halted & (cosine < jnp.cbrt(jnp.finfo(te.dtype).eps)) & (bend > 0)
     points = stack(stepper.points(y, before, increments)) if want_points else None
     f_after = model.flow(t_after, after, state_after)
-    return Landing(found, te, t_after, before, after, f_after, state_after, slot, news, points, result)
+    return Landing(found, te, t_after, before, after, f_after, state_after, slot, news, points, cosine, grazes, result)
+
+
+def transversality(
+    model: Model, t: Scalar, y: Y, state: State, slot: Int[Array, ""], part: Int[Array, ""]
+) -> tuple[Scalar, Scalar]:
+    """The cosine between the trajectory and the normal of the surface it meets, in time and state, and the second
+    derivative of the guard along the trajectory."""
+    model, t, y = frozen((model, t, y))
+    flat, unravel = jfu.ravel_pytree(y)
+    f = model.flow(t, y, state)
+
+    def guard(t: Scalar, y: Y) -> Scalar:
+        return model.stacked(model.guards(t, y, state), -1.0)[slot, part]
+
+    def rate(t: Scalar, y: Y) -> Scalar:
+        return jax.jvp(guard, (t, y), (jnp.ones_like(t), model.flow(t, y, state)))[1]
+
+    fall, bend = jax.jvp(rate, (t, y), (jnp.ones_like(t), f))
+    h_t, n = jax.grad(lambda t, x: guard(t, unravel(x)), argnums=(0, 1))(t, flat)
+    flow = jfu.ravel_pytree(f)[0]
+    size = (n @ n + h_t**2) * (flow @ flow + jnp.where(h_t == 0, 0, 1))
+    return jnp.abs(fall) / jnp.sqrt(size), bend
 
 
 class Completed(NamedTuple):

@@ -17,7 +17,7 @@ from ._check import check_solve
 from ._filippov import Model
 from ._jacobian import dense_jacobian
 from ._saltation import _states
-from ._solution import Events, RESULTS, Solution
+from ._solution import Events, is_okay, RESULTS, Solution
 from ._solve import solve
 from ._system import arrays_of, frozen, relay, sgn, System
 from ._types import Scalar, Y
@@ -111,7 +111,7 @@ def _base_point(system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any, me
     gap = _distance(later / jnp.where(extent == 0, 1, extent), _flat(here) / jnp.where(extent == 0, 1, extent))
     # Of equally near returns the one nearest to the guess: a user who asks for two laps gets two.
     best = share[jnp.argmin(gap + 0.05 * jnp.abs(share - 1))]
-    reached = sol.result == RESULTS.successful
+    reached = is_okay(sol.result)
     return here, jnp.where(reached, best, 1) * period
 
 
@@ -142,7 +142,7 @@ def _shoot(
     def flow(system: System, x: Array, period: Scalar) -> Array:
         sol = solve(system, t0, t0 + period, unravel(x), mode=mode, throw=False, **method)
         # A solution that ended early is no solution: Newton's method must not be led by it.
-        ok = sol.result == RESULTS.successful
+        ok = is_okay(sol.result)
         return jnp.where(ok, _flat(sol.y1), jnp.nan)
 
     if autonomous:
@@ -199,7 +199,7 @@ def _shoot(
     repeats = jnp.zeros((), bool)
     for p in primes:
         repeats = repeats | (away[int(np.argmin(np.abs(fractions - 1 / p)))] <= 1e-6 * amplitude)
-    good = (found.result == optx.RESULTS.successful) & (error <= 1e3 * tol * size) & (sol.result == RESULTS.successful)
+    good = (found.result == optx.RESULTS.successful) & (error <= 1e3 * tol * size) & is_okay(sol.result)
     result = RESULTS.where(good, RESULTS.successful, RESULTS.orbit_not_found)
     result = RESULTS.where(good & repeats, RESULTS.orbit_is_multiple_cover, result)
     if autonomous:

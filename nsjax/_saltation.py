@@ -76,10 +76,6 @@ class _Jump(NamedTuple):
     rest_t: Scalar
     onto: Float[Array, "n n"]  # the linearised constraints of resting contact
 
-    @property
-    def rate(self) -> Scalar:
-        return self.n @ self.f_before + self.h_t
-
 
 def _jump(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> _Jump:
     flat, unravel = jfu.ravel_pytree(y)
@@ -123,7 +119,7 @@ def _matrix(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) 
     j = _jump(model, t, y, k, before, after)
     late = 1 + j.drest @ j.f_before + j.rest_t  # how much later the state of rest begins when the impact does
     turn = j.f_after * late - j.dr @ j.f_before - j.r_t
-    return j.onto @ (j.dr - jnp.outer(j.f_after, j.drest) + jnp.outer(turn, j.n) / j.rate)
+    return j.onto @ (j.dr - jnp.outer(j.f_after, j.drest) + jnp.outer(turn, j.n) / (j.n @ j.f_before + j.h_t))
 
 
 def saltation_matrix(
@@ -157,32 +153,15 @@ def saltation_matrix(
     return _matrix(model, t, y, names.index(switch), before, after)
 
 
-def _over_log(system: System, events: Events, fn: Any) -> Array:
+def saltation_matrices(system: System, events: Events) -> Float[Array, "events n n"]:
+    """`saltation_matrix` of every event of a log; rows past the last event are NaN."""
     dtype = events.t.dtype
     system = arrays_of(system, dtype)
     template = jax.tree.map(lambda x: x[0], events.y_before)
     model = Model(system, jnp.ones((), dtype), jnp.zeros((), dtype), template)
 
     def one(t: Scalar, y: Y, switch: Array, before: Array, after: Array) -> Array:
-        options = [fn(model, t, y, k, tuple(before), tuple(after)) for k in range(len(model.switches))]
+        options = [_matrix(model, t, y, k, tuple(before), tuple(after)) for k in range(len(model.switches))]
         return jnp.select([switch == k for k in range(len(options))], options, jnp.nan)
 
     return jax.vmap(one)(events.t, events.y_before, events.switch, events.mode_before, events.mode_after)
-
-
-def saltation_matrices(system: System, events: Events) -> Float[Array, "events n n"]:
-    """`saltation_matrix` of every event of a log; rows past the last event are NaN."""
-    return _over_log(system, events, _matrix)
-
-
-def transversality(system: System, events: Events) -> Float[Array, " events"]:
-    """How squarely each event of a log meets its surface: |nᵀ f⁻ + h_t| / sqrt((|n|² + h_t²) (|f⁻|² + 1)), the cosine
-    between the normal of the surface and the trajectory in time and state, from 0 (tangency, where derivatives do not
-    exist) to 1; rows past the last event are NaN."""
-
-    def cosine(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Scalar:
-        j = _jump(model, t, y, k, before, after)
-        size = (j.n @ j.n + j.h_t**2) * (j.f_before @ j.f_before + jnp.where(j.h_t == 0, 0, 1))
-        return jnp.abs(j.rate) / jnp.sqrt(size)
-
-    return _over_log(system, events, cosine)

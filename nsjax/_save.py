@@ -52,6 +52,7 @@ class Log(eqx.Module):
     after: Y
     slot: Int[Array, " events"]
     modes: Int[Array, "events switches"]  # after the event
+    transversality: Float[Array, " events"]
 
     def __init__(self, capacity: int, y: Y, switches: int):
         dtype = jnp.result_type(*jax.tree.leaves(y))
@@ -61,12 +62,16 @@ class Log(eqx.Module):
         self.after = blank
         self.slot = jnp.full(capacity, -1, jnp.int32)
         self.modes = jnp.full((capacity, switches), NO_MODE, jnp.int32)
+        self.transversality = jnp.full(capacity, jnp.nan, dtype)
 
-    def write(self, index: Any, when: Any, t: Scalar, before: Y, after: Y, slot: Any, mode: tuple) -> "Log":
-        row = (t, before, after, slot.astype(jnp.int32), jnp.stack(mode))
-        old = (self.t, self.before, self.after, self.slot, self.modes)
-        new = _put(old, index, row, when)
-        return eqx.tree_at(lambda s: (s.t, s.before, s.after, s.slot, s.modes), self, new)
+    def write(
+        self, index: Any, when: Any, t: Scalar, before: Y, after: Y, slot: Any, mode: tuple, transversality: Scalar
+    ) -> "Log":
+        def columns(log: Log) -> tuple:
+            return log.t, log.before, log.after, log.slot, log.modes, log.transversality
+
+        row = (t, before, after, slot.astype(jnp.int32), jnp.stack(mode), transversality)
+        return eqx.tree_at(columns, self, _put(columns(self), index, row, when))
 
 
 class Saved(eqx.Module):

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ._step import bernstein
 from ._system import System
@@ -18,6 +18,10 @@ from ._types import Scalar, Y
 class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """Diffrax's results, and those of nonsmooth flows."""
 
+    tangential_event = (
+        "A surface was met tangentially (grazing): nᵀf⁻ + h_t vanishes there, see `sol.events.transversality`. The "
+        "solution is right, but its derivatives through that event are not defined."
+    )
     max_events_reached = (
         "The maximum number of events was reached. Increase `max_events`; if events crowd together, look at "
         "`sol.events`."
@@ -58,6 +62,11 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
+def is_okay(result: RESULTS) -> Bool[Array, ""]:
+    """Whether a solution reached its end: successfully, or through a tangential event."""
+    return (result == RESULTS.successful) | (result == RESULTS.tangential_event)
+
+
 class Event(NamedTuple):
     """One event of a solution, as `for event in sol.events` yields it."""
 
@@ -67,6 +76,7 @@ class Event(NamedTuple):
     mode_after: dict[str, int]
     y_before: Any
     y_after: Any
+    transversality: Any
 
 
 class Events(eqx.Module):
@@ -79,6 +89,10 @@ class Events(eqx.Module):
     - `mode_before`, `mode_after`: shape `(max_events, number of switches)`; for `sgn` +1, -1, or 0
       while sliding; `relay` 0 or 1; `impact` 1 while resting in contact.
     - `y_before`, `y_after`: the state on either side, leaves with a leading axis of length `max_events`.
+    - `transversality`: how squarely each met its surface: |nᵀf⁻ + h_t| / sqrt((|n|² + h_t²) (|f⁻|² + 1)), the cosine
+      between the surface's normal and the trajectory in time and state (without the 1 where h_t = 0), from 0 (tangency,
+      where derivatives do not exist) to 1. Where it is below eps^(1/3) (6e-6; for float32 5e-3) and h has a minimum,
+      not the end of a short flight, the solution's result is `RESULTS.tangential_event`.
     - `num`: how many there were.
     """
 
@@ -88,6 +102,7 @@ class Events(eqx.Module):
     mode_after: Int[Array, "events switches"]
     y_before: Y
     y_after: Y
+    transversality: Float[Array, " events"]
     num: Int[Array, ""]
     names: tuple[str, ...] = eqx.field(static=True)
 
@@ -103,10 +118,9 @@ class Events(eqx.Module):
         def named(mode: Array) -> dict[str, int]:
             return {name: int(m) for name, m in zip(self.names, mode)}
 
-        at = jax.tree.map(lambda x: x[i], (self.t, self.y_before, self.y_after))
-        return Event(
-            at[0], self.names[int(self.switch[i])], named(self.mode_before[i]), named(self.mode_after[i]), at[1], at[2]
-        )
+        t, *rest = jax.tree.map(lambda x: x[i], (self.t, self.y_before, self.y_after, self.transversality))
+        modes = named(self.mode_before[i]), named(self.mode_after[i])
+        return Event(t, self.names[int(self.switch[i])], *modes, *rest)
 
     def __iter__(self) -> Iterator[Event]:
         return (self[i] for i in range(len(self)))

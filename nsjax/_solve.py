@@ -23,7 +23,7 @@ from ._event import land, Landing
 from ._filippov import Model, State
 from ._once import once
 from ._save import Log, Saved
-from ._solution import Events, RESULTS, Solution
+from ._solution import Events, is_okay, RESULTS, Solution
 from ._start import start_mode
 from ._step import stack, Stepper
 from ._structure import is_affine
@@ -47,6 +47,7 @@ class _Carry(eqx.Module):
     events: Int[Array, ""]
     halted: Int[Array, ""]  # events in a row without progress in time
     halvings: Int[Array, ""]  # in a row, to resolve a guard
+    grazed: Bool[Array, ""]  # whether an event was tangential
     log: Log | None
     saved: Saved
     meter: PyTree
@@ -162,7 +163,7 @@ class _Flow(eqx.Module):
         f_end = stepper.last_slope(ks, t_next - c.t, flow, t_next, y_end)
         t, y, f, state = t_next, y_end, f_end, c.state
         event = jnp.zeros((), bool)
-        events, halted, log = c.events, c.halted, c.log
+        events, halted, grazed, log = c.events, c.halted, c.grazed, c.log
         t_stop, points, before = t_next, None, y1
         if self.want_points:
             points = stack(stepper.points(c.y, y1, ks))
@@ -179,6 +180,8 @@ class _Flow(eqx.Module):
                 jnp.zeros((), jnp.int32),
                 event,
                 points,
+                c.t,
+                event,
                 RESULTS.successful,
             )
             there = _landed(busy, self, here, still)
@@ -196,15 +199,10 @@ class _Flow(eqx.Module):
                 points = pick(there.points, points)
             log_it = event & there.news
             assert log is not None
-            log = log.write(
-                events,
-                log_it,
-                there.t_after * model.direction,
-                there.y_before,
-                there.y_after,
-                there.slot,
-                there.state.mode,
-            )
+            at = there.t_after * model.direction
+            row = (at, there.y_before, there.y_after, there.slot, there.state.mode, there.transversality)
+            log = log.write(events, log_it, *row)
+            grazed = grazed | (event & there.grazes)
             events = events + log_it.astype(jnp.int32)
             halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(keep, 0, halted))
             result = RESULTS.where(event, there.result, result)
@@ -264,6 +262,7 @@ class _Flow(eqx.Module):
             events=events,
             halted=halted,
             halvings=halvings,
+            grazed=grazed,
             log=log,
             saved=saved,
             meter=meter,
@@ -380,6 +379,7 @@ def _run(
         events=zero,
         halted=zero,
         halvings=zero,
+        grazed=jnp.zeros((), bool),
         log=Log(max_events, y0, len(model.switches)) if model.slots else None,
         saved=saved,
         meter=meter.init(),
@@ -394,6 +394,7 @@ def _run(
     dynamic = lax.while_loop(lambda c: eqxi.unvmap_any(c.active), body, dynamic)
     c: _Carry = eqx.combine(dynamic, static)
     meter.close(c.meter)
+    result = RESULTS.where(c.grazed & (c.result == RESULTS.successful), RESULTS.tangential_event, c.result)
     saved = c.saved
     if request.t1:
         saved = saved.write(True, c.t, c.y, c.state.mode, system, direction)
@@ -414,11 +415,11 @@ def _run(
             "num_events": c.events,
             "max_steps": max_steps,
         },
-        result=c.result,
+        result=result,
         dense=None if saved.dense is None else (*saved.dense, direction, c.accepted),
     )
     if throw:
-        sol = c.result.error_if(sol, c.result != RESULTS.successful)
+        sol = result.error_if(sol, ~is_okay(result))
     return sol
 
 
@@ -444,6 +445,7 @@ def _events(model: Model, c: _Carry, start: State) -> Events:
         mode_after=log.modes,
         y_before=log.before,
         y_after=log.after,
+        transversality=log.transversality,
         num=c.events,
         names=tuple(k.name for k in model.switches),
     )

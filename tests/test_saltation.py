@@ -13,7 +13,7 @@ from models import Motion, pid
 from scipy.linalg import expm
 
 import nsjax
-from nsjax import gallery, saltation_matrices, saltation_matrix, solve, transversality
+from nsjax import gallery, saltation_matrices, saltation_matrix, solve
 
 
 class Swell(nsjax.System):
@@ -200,12 +200,12 @@ def test_transversality_of_a_log():
     normal, speed = np.array([1, -0.5 * np.cos(t)]), np.array([v, 1])
     acceleration = -float(e.y_before.x) - 1
     want = abs(normal @ speed) / np.linalg.norm(normal) / np.linalg.norm([v, acceleration, 1])
-    np.testing.assert_allclose(transversality(system, events)[0], want, rtol=1e-12)
-    assert np.isnan(transversality(system, events)[1:]).all()
+    np.testing.assert_allclose(events.transversality[0], want, rtol=1e-12)
+    assert np.isnan(events.transversality[1:]).all()
     # Autonomous: time does not count.
     system = floats(gallery.StickSlip())
     _, (_, log) = runner()(system, np.array([2.0, 0.0]), 0.0, 14.0)
-    first, last = transversality(system, log)[:2]
+    first, last = log.transversality[:2]
     v, a = float(log.y_before.v[0]), -float(log.y_before.x[0]) + 1
     np.testing.assert_allclose(first, a / np.hypot(v, a), rtol=1e-7)
     np.testing.assert_allclose(last, 1, rtol=1e-12)

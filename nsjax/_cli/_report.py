@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._orbit import Orbit
-from .._saltation import saltation_matrices, transversality
+from .._saltation import saltation_matrices
 from .._solution import Events, RESULTS, Solution
 from .._system import System
 from .._types import Y
@@ -143,7 +143,7 @@ def _orbit_text(job: Job, orbit: Orbit, units: Units) -> str:
     parts = [str(orbit).rstrip()]
     if len(orbit.events):
         parts.append("events of the orbit\n" + _event_table(orbit.events, units, len(orbit.events)))
-        matrices, _ = _linearised(job.system, orbit.events)
+        matrices = _linearised(job.system, orbit.events)
         for i, e in enumerate(orbit.events):
             change = _change(e.switch, e.mode_before, e.mode_after)
             parts.append(f"saltation matrix at t = {_number(e.t)}, {e.switch}: {change}\n" + _matrix(matrices[i]))
@@ -180,14 +180,14 @@ def _named(y: Y) -> dict[str, Any]:
 
 
 @eqx.filter_jit
-def _linearised(system: System, events: Events) -> tuple[Array, Array]:
-    return saltation_matrices(system, events), transversality(system, events)
+def _linearised(system: System, events: Events) -> Array:
+    return saltation_matrices(system, events)
 
 
 def _events(system: System, events: Events) -> list[dict[str, Any]]:
     if not len(events):
         return []
-    matrices, cosines = _linearised(system, events)
+    matrices = _linearised(system, events)
     return [
         {
             "t": e.t,
@@ -197,7 +197,7 @@ def _events(system: System, events: Events) -> list[dict[str, Any]]:
             "y": _named(e.y_before),
             "y_after": _named(e.y_after),
             "saltation": matrices[i],
-            "transversality": cosines[i],
+            "transversality": e.transversality,
         }
         for i, e in enumerate(events)
     ]

@@ -1,0 +1,97 @@
+"""Tangential contact from both sides: the value stands, the derivative is right or said not to exist."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import Motion, pid
+
+import nsjax
+from nsjax import RESULTS, solve
+
+
+class Touch(nsjax.System):
+    """x = cos t from t = -π on, with a wall at 1 + gap, which it touches at t = 0 if gap = 0."""
+
+    gap: float = 0.0
+    e: float = 0.5
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - s.wall)
+
+    @nsjax.impact
+    def wall(self, t, y):
+        return 1 + self.gap - y.x
+
+    @wall.restitution
+    def wall(self):
+        return self.e
+
+
+class Graze(Touch):
+    """The same with a surface that changes the field: twice the stiffness beyond it."""
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - 0.5 * (1 - s.wall) * (y.x - 1 - self.gap))
+
+    @nsjax.sgn
+    def wall(self, t, y):
+        return 1 + self.gap - y.x
+
+
+@jax.jit
+def run(system):
+    sol = solve(
+        system, -np.pi, 3.0, Motion(-1.0, 0.0), solver=dfx.Dopri8(), stepsize_controller=pid(1e-12), throw=False
+    )
+    return jnp.stack(sol.y1), sol.result, sol.events
+
+
+def impact(gap, e=0.5):
+    """State at t = 3 in closed form."""
+    wall = 1 + gap
+    hit = jnp.arccos(jnp.minimum(wall, 1.0))
+    v = -e * jnp.sin(hit)
+    late = 3.0 + hit
+    return jnp.stack([wall * jnp.cos(late) + v * jnp.sin(late), -wall * jnp.sin(late) + v * jnp.cos(late)])
+
+
+@pytest.mark.parametrize("gap", [1e-3, 1e-9])
+def test_just_missing(gap):
+    """Pitfall 10: no event, and no status."""
+    for system in (Touch(gap), Graze(gap)):
+        y, result, events = run(system)
+        assert result == RESULTS.successful and events.num == 0
+        np.testing.assert_allclose(y, [np.cos(3), -np.sin(3)], atol=1e-10)
+
+
+@pytest.mark.parametrize("gap", [-1e-4, -1e-8])
+def test_just_touching(gap):
+    """Pitfall 10: an impact with a speed of 1.4e-2 or 1.4e-4, and its derivative of 60 or 6000."""
+    y, result, events = run(Touch(gap))
+    assert result == RESULTS.successful and events.num == 1
+    speed = np.sqrt(-2 * gap - gap**2)
+    np.testing.assert_allclose(y, impact(gap), atol=1e-11 / speed)
+    np.testing.assert_allclose(events.transversality[0], speed / np.hypot(speed, 1 + gap), rtol=1e-10 / speed**2)
+    derivative = jax.jacfwd(lambda gap: run(Touch(gap))[0])(gap)
+    np.testing.assert_allclose(derivative, jax.jacfwd(impact)(gap), rtol=1e-10 / speed**2)
+
+
+@pytest.mark.parametrize("gap", [0.0, -1e-13])
+def test_tangential(gap):
+    """Pitfall 10: told by the status, which is no failure; the value has the square root of the accuracy."""
+    for system in (Touch(gap), Graze(gap)):
+        y, result, events = run(system)
+        met = events.num > 0
+        assert result == (RESULTS.tangential_event if met else RESULTS.successful) and nsjax.is_okay(result)
+        assert not met or events.transversality[0] < 6e-6
+        np.testing.assert_allclose(y, [np.cos(3), -np.sin(3)], atol=2e-5)
+    assert run(Touch(-1e-12))[1] == RESULTS.tangential_event
+    solve(Touch(-1e-12), -np.pi, 1.0, Motion(-1.0, 0.0), stepsize_controller=pid(1e-12))  # does not raise
+
+
+def test_square_root_is_not_floored():
+    """The derivative grows as the grazing is approached, like the inverse of the speed."""
+    slopes = [jax.jacfwd(lambda gap: run(Touch(gap))[0])(gap)[1] * np.sqrt(-gap) for gap in (-1e-5, -1e-7, -1e-9)]
+    np.testing.assert_allclose(slopes, 1.5 / np.sqrt(2) * np.cos(3), rtol=2e-2)
