@@ -38,13 +38,13 @@ class Landing(NamedTuple):
 
 
 def _step_to(te: Scalar, stepper: Stepper, args: tuple) -> tuple[Y, list[Y]]:
-    model, t, y, f0, state, _, _ = args
+    model, t, y, f0, state, *_ = args
     y_end, _, increments, _ = stepper(lambda t, y: model.flow(t, y, state), t, te, y, f0)
     return y_end, increments
 
 
 def _guard(te: Scalar, y: Y, args: tuple) -> Scalar:
-    model, _, _, _, state, slot, part = args
+    model, _, _, _, state, slot, part, _ = args
     return model.stacked(model.guards(te, y, state), -1.0)[slot, part]
 
 
@@ -63,14 +63,14 @@ def _arrival(te: Scalar, y_end: Y, stepper: Stepper, args: Any) -> tuple[Scalar,
 def _arrival_jvp(primals: Any, tangents: Any) -> tuple[tuple[Scalar, Y], tuple[Scalar, Y]]:
     te, y_end, stepper, args = primals
     te, y_end = _arrival(te, y_end, stepper, args)
-    model, state = args[0], args[4]
+    model, state, found = args[0], args[4], args[7]
     moved = eqx.filter_jvp(lambda args: _step_to(te, stepper, args)[0], (args,), (tangents[3],))[1]
     moved = jax.tree.map(lambda y, d: jnp.zeros_like(y) if d is None else d, y_end, moved)
     change = eqx.filter_jvp(lambda y, args: _guard(te, y, args), (y_end, args), (moved, tangents[3]))[1]
     change = jnp.zeros_like(te) if change is None else change
     f = model.flow(te, y_end, state)
     slope = jax.jvp(lambda t, y: _guard(t, y, args), (te, y_end), (jnp.ones_like(te), f))[1]
-    shift = -change / slope
+    shift = -change / jnp.where(found, slope, 1)
     return (te, y_end), (shift, jax.tree.map(lambda d, f: d + f * shift, moved, f))
 
 
@@ -120,7 +120,7 @@ def locate(
     dt = te - guess
     bend = jax.jvp(flow, (guess, y_guess), (one, f))[1]
     y_end = jax.tree.map(lambda y, f, b: y + dt * (f + 0.5 * dt * b), y_guess, f, bend)
-    te, y_end = _arrival(te, y_end, stepper, (*args, slot, part[slot]))
+    te, y_end = _arrival(te, y_end, stepper, (*args, slot, part[slot], jnp.any(found)))
     # At the very start of the step the event is a consequence of the one before: it has the same time and derivative.
     at_once = jnp.isfinite(root[slot]) & (root[slot] <= 0)
     te, y_end = jax.tree.map(lambda a, b: jnp.where(at_once, a, b), (t, y), (te, y_end))

@@ -39,8 +39,12 @@ def _call_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
             full[i] = value
         fn, args = jax.tree.unflatten(tree, full)
         out = fn(*args)
-        return jfu.ravel_pytree(out)[0], out
+        smooth, rest = eqx.partition(out, eqx.is_inexact_array)
+        arrays, static = eqx.partition(rest, eqx.is_array)
+        kept.append(static)
+        return smooth, (smooth, arrays)
 
-    matrix, out = jax.jacfwd(flat, has_aux=True)(x)
-    _, restore = jfu.ravel_pytree(out)
-    return out, restore(jnp.dot(matrix, dx))
+    kept: list[Any] = []
+    # Leaf by leaf: the Jacobian of a result that nobody uses is never computed.
+    matrices, (smooth, arrays) = jax.jacfwd(flat, has_aux=True)(x)
+    return eqx.combine(smooth, arrays, kept[0]), jax.tree.map(lambda m: jnp.dot(m, dx), matrices)

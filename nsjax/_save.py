@@ -7,7 +7,6 @@ import diffrax as dfx
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
-import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -123,7 +122,15 @@ class Saved(eqx.Module):
         )
 
     def write_times(
-        self, when: Bool[Array, ""], t0: Scalar, t1: Scalar, points: Y, mode: tuple, system: Any, direction: Any
+        self,
+        when: Bool[Array, ""],
+        t0: Scalar,
+        t1: Scalar,
+        points: Y,
+        mode: tuple,
+        system: Any,
+        direction: Any,
+        reverse: bool,
     ) -> "Saved":
         """Saves every requested time up to `t1`, from the dense output of the step (t0, t1)."""
         times = self.request.ts
@@ -144,10 +151,12 @@ class Saved(eqx.Module):
             return eqx.tree_at(lambda s: s.next, saved, saved.next + now.astype(jnp.int32))
 
         dynamic, static = eqx.partition(self, eqx.is_array)
-        dynamic = lax.while_loop(
+        options = dict(kind="checkpointed", max_steps=len(times)) if reverse else dict(kind="lax")
+        dynamic = eqxi.while_loop(
             lambda d: eqxi.unvmap_any(due(eqx.combine(d, static))),
             lambda d: eqx.filter(save(eqx.combine(d, static)), eqx.is_array),
             dynamic,
+            **options,
         )
         return eqx.combine(dynamic, static)
 

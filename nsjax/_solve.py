@@ -21,13 +21,15 @@ from ._compact import compact_cond
 from ._crossing import deflate, elevate, nodes, to_bernstein, to_chebyshev
 from ._event import land, Landing
 from ._filippov import Model, State
+from ._forward import forward_only
+from ._jacobian import dense_jacobian
 from ._once import once
 from ._save import Log, Saved
 from ._solution import Events, is_okay, RESULTS, Solution
 from ._start import start_mode
 from ._step import stack, Stepper
 from ._structure import is_affine
-from ._system import arrays_of, System
+from ._system import arrays_of, frozen, System
 from ._types import Scalar, Y
 
 
@@ -68,6 +70,7 @@ class _Flow(eqx.Module):
     meter: dfx.AbstractProgressMeter
     affine: tuple[bool, ...] = eqx.field(static=True)  # whether each guard is affine in (t, y)
     degree: int = eqx.field(static=True)  # of the polynomial for one that is not
+    reverse: bool = eqx.field(static=True)  # whether the loop is to be transposed
 
     def coefficients(
         self, t: Scalar, t_next: Scalar, y: Y, y1: Y, ks: list[Y], state: State
@@ -135,10 +138,13 @@ class _Flow(eqx.Module):
         # An error that is not a number is too large.
         error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
         terms = dfx.ODETerm(lambda t, y, args: flow(t, y))
+        # The step size is no function to be differentiated; powers of an error of zero are not even differentiable.
+        t_still, t_next_still, y_still, y1_still, error = frozen((c.t, t_next, c.y, y1, error))
+        order = stepper.solver.error_order(terms)
         keep, a, b, _, controller, outcome = self.controller.adapt_step_size(
-            c.t, t_next, c.y, y1, None, error, stepper.solver.error_order(terms), c.controller
+            t_still, t_next_still, y_still, y1_still, None, error, order, c.controller
         )
-        dt = lax.stop_gradient(b - a)
+        dt = b - a
         halvings = c.halvings
         result = RESULTS.promote(outcome)
 
@@ -216,7 +222,8 @@ class _Flow(eqx.Module):
 
         saved = c.saved
         if saved.request.ts is not None:
-            saved = saved.write_times(moved, c.t, t_stop, points, c.state.mode, model.system, model.direction)
+            mode = c.state.mode
+            saved = saved.write_times(moved, c.t, t_stop, points, mode, model.system, model.direction, self.reverse)
         saved = saved.write_step(moved, c.accepted, c.t, t_stop, points)
         accepted = c.accepted + moved.astype(jnp.int32)
         if self.keep_steps:
@@ -294,6 +301,8 @@ def _landed(pred: Any, flow: _Flow, here: tuple, default: Landing) -> Landing:
         flow, here = eqx.combine(dynamic, static)
         return eqx.filter(flow.land(*here), eqx.is_array)
 
+    if flow.reverse:  # `compact_cond` knows no transposition
+        return eqx.combine(lax.cond(pred, branch, lambda _: dynamic_default, dynamic), static_default)
     return eqx.combine(compact_cond(pred, branch, (dynamic,), dynamic_default), static_default)
 
 
@@ -310,9 +319,43 @@ def _run(
     dt0: Scalar | None,
     max_steps: int,
     max_events: int,
+    adjoint: dfx.AbstractAdjoint,
     throw: bool,
     meter: dfx.AbstractProgressMeter,
 ) -> Solution:
+    def run(system: System, t0: Scalar, t1: Scalar, y0: Y) -> Solution:
+        options = solver, controller, saveat, dt0, max_steps, max_events, adjoint, throw, meter
+        return _integrate(system, t0, t1, y0, given, *options)
+
+    if isinstance(adjoint, dfx.DirectAdjoint):
+        return dense_jacobian(run, system, t0, t1, y0)
+    if not isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
+        system, t0, t1, y0 = forward_only(
+            (system, t0, t1, y0),
+            "`nsjax.solve` was differentiated in reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`), which needs "
+            "`adjoint=diffrax.DirectAdjoint()` (up to some tens of parameters and states) or "
+            "`adjoint=diffrax.RecursiveCheckpointAdjoint()` (more). Or use `jax.jacfwd`.",
+        )
+    return run(system, t0, t1, y0)
+
+
+def _integrate(
+    system: System,
+    t0: Scalar,
+    t1: Scalar,
+    y0: Y,
+    given: dict[str, Any],
+    solver: dfx.AbstractSolver,
+    controller: dfx.AbstractStepSizeController,
+    saveat: dfx.SaveAt,
+    dt0: Scalar | None,
+    max_steps: int,
+    max_events: int,
+    adjoint: dfx.AbstractAdjoint,
+    throw: bool,
+    meter: dfx.AbstractProgressMeter,
+) -> Solution:
+    reverse = isinstance(adjoint, dfx.RecursiveCheckpointAdjoint)
     direction = jnp.where(t1 >= t0, 1, -1).astype(t0.dtype)
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
@@ -347,7 +390,7 @@ def _run(
         saved = saved.write(True, start, y0, state.mode, system, direction)
     if request.ts is not None:
         blank = jax.tree.map(lambda x: jnp.stack([x] * (stepper.degree + 1)), y0)
-        saved = saved.write_times(jnp.ones((), bool), start, start, blank, state.mode, system, direction)
+        saved = saved.write_times(jnp.ones((), bool), start, start, blank, state.mode, system, direction, reverse)
     flow = _Flow(
         model=model,
         stepper=stepper,
@@ -361,6 +404,7 @@ def _run(
         meter=meter,
         affine=affine,
         degree=max(8, stepper.degree + 3),
+        reverse=reverse,
     )
     zero = jnp.zeros((), jnp.int32)
     bad = ~_finite((y0, f0, start, stop))
@@ -391,7 +435,11 @@ def _run(
         return jax.tree.map(lambda old, x: x.astype(old.dtype), dynamic, new)
 
     # `unvmap_any` keeps the predicate unbatched, so that ended lanes cost no copy of the buffers.
-    dynamic = lax.while_loop(lambda c: eqxi.unvmap_any(c.active), body, dynamic)
+    if isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
+        options = dict(kind="checkpointed", max_steps=max_steps, checkpoints=adjoint.checkpoints)
+    else:
+        options = dict(kind="lax")
+    dynamic = eqxi.while_loop(lambda c: eqxi.unvmap_any(c.active), body, dynamic, **options)
     c: _Carry = eqx.combine(dynamic, static)
     meter.close(c.meter)
     result = RESULTS.where(c.grazed & (c.result == RESULTS.successful), RESULTS.tangential_event, c.result)
@@ -464,6 +512,7 @@ def solve(
     dt0: Any = None,
     max_steps: int = 4096,
     max_events: int = 256,
+    adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
     throw: bool = True,
     progress_meter: dfx.AbstractProgressMeter = dfx.NoProgressMeter(),
 ) -> Solution:
@@ -487,6 +536,11 @@ def solve(
     - `saveat`: as in diffrax: `t0`, `t1`, `ts`, `steps`, `fn(t, y, system)`, `dense`.
     - `dt0`: first step; chosen automatically by default.
     - `max_steps`, `max_events`: bounds, also the capacity of dense output and of the event log.
+    - `adjoint`: how derivatives are taken. `diffrax.ForwardMode()`, the default: `jax.jvp` and `jax.jacfwd`, of every
+        order. For `jax.grad`, `jax.vjp`, `jax.jacrev`: `diffrax.DirectAdjoint()` multiplies by the Jacobian, found in
+        forward mode, at the cost of a forward derivative for each number among `y0`, the parameters and the times that
+        is perturbed: the choice up to some tens of them. `diffrax.RecursiveCheckpointAdjoint()` goes back through the
+        steps, whatever their number: the choice for more. (Both also under `jax.jacfwd`: `hessian` works.)
     - `throw`: whether a failure raises; if not, look at `Solution.result`, which has one entry a lane under `vmap`.
     - `progress_meter`: as in diffrax.
 
@@ -509,5 +563,18 @@ def solve(
     if dt0 is not None:
         dt0 = jnp.abs(jnp.asarray(dt0, t0.dtype))
     return _run(
-        system, t0, t1, y0, given, solver, controller, saveat, dt0, max_steps, max_events, throw, progress_meter
+        system,
+        t0,
+        t1,
+        y0,
+        given,
+        solver,
+        controller,
+        saveat,
+        dt0,
+        max_steps,
+        max_events,
+        adjoint,
+        throw,
+        progress_meter,
     )

@@ -18,6 +18,7 @@ ORDER = (
     "_system",
     "_compact",
     "_jacobian",
+    "_forward",
     "_filippov",
     "_crossing",
     "_step",

@@ -1,0 +1,137 @@
+"""Reverse mode: wherever forward mode works, by the whole Jacobian and by going back through the steps."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import Hammer, Motion, pid
+
+import nsjax
+from nsjax import gallery, solve
+
+
+ADJOINTS = {"jacobian": dfx.DirectAdjoint(), "checkpoint": dfx.RecursiveCheckpointAdjoint()}
+CHEAP = dict(solver=dfx.Bosh3(), stepsize_controller=pid(1e-6), max_steps=256, max_events=16)
+
+
+def stick_slip(p, adjoint, **kwargs):
+    """Through slip, stick and slip again: the state at the end and the times of the events."""
+    system = gallery.StickSlip(k=p[2], v_dr=p[3], F_slip=p[4])
+    sol = solve(system, 0.0, 14.0, Motion(p[0], p[1]), adjoint=adjoint, **(CHEAP | kwargs))
+    return jnp.concatenate([jnp.stack(sol.y1), sol.events.t[:2]])
+
+
+POINT = jnp.array([2.0, 0.0, 1.1, 0.2, 0.9])
+
+
+@pytest.fixture(scope="module")
+def forward():
+    return jax.jit(jax.jacfwd(lambda p: stick_slip(p, dfx.ForwardMode())))(POINT)
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_reverse_is_forward(forward, adjoint):
+    """Sliding entry, static breakaway, event times."""
+    backward = jax.jit(jax.jacrev(lambda p: stick_slip(p, ADJOINTS[adjoint])))(POINT)
+    np.testing.assert_allclose(backward, forward, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_lanes(forward, adjoint):
+    """Pitfall 18: under `vmap` the event's branch is run by lanes that have no event."""
+    points = POINT + jnp.arange(3.0)[:, None] * jnp.array([0.0, 0.01, 0.0, 0.1, 0.0])
+    run = jax.jit(jax.vmap(jax.grad(lambda p: jnp.sum(stick_slip(p, ADJOINTS[adjoint])))))
+    gradient = run(points)
+    np.testing.assert_allclose(gradient[0], jnp.sum(forward, 0), rtol=1e-10)
+    assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_impacts_and_saved_states(adjoint):
+    """Restitution, states between steps, and the end time."""
+
+    def squares(z, adjoint):
+        system = Hammer(omega=z[0], e=z[1])
+        saveat = dfx.SaveAt(ts=jnp.linspace(0.5, 5.5, 7), t1=True)
+        options = CHEAP | dict(max_steps=1024)
+        sol = solve(system, 0.0, z[2], Motion(1.0, 0.0), saveat=saveat, adjoint=adjoint, **options)
+        return jnp.sum(sol.ys.x**2 + sol.ys.v**2)
+
+    z = jnp.array([2.8, 0.8, 6.0])
+    want = jax.jit(jax.jacfwd(lambda z: squares(z, dfx.ForwardMode())))(z)
+    got = jax.jit(jax.grad(lambda z: squares(z, ADJOINTS[adjoint])))(z)
+    np.testing.assert_allclose(got, want, rtol=1e-9)
+
+
+def test_hessian():
+    """Forward over reverse, against forward over forward."""
+
+    def energy(p, adjoint):
+        return jnp.sum(stick_slip(p, adjoint)[:2] ** 2)
+
+    want = jax.jit(jax.jacfwd(jax.jacfwd(lambda p: energy(p, dfx.ForwardMode()))))(POINT)
+    got = jax.jit(jax.hessian(lambda p: energy(p, dfx.DirectAdjoint())))(POINT)
+    np.testing.assert_allclose(got, want, rtol=1e-8, atol=1e-8)
+
+
+def test_default_says_what_to_do():
+    with pytest.raises(Exception, match="DirectAdjoint.*RecursiveCheckpointAdjoint"):
+        jax.grad(lambda p: stick_slip(p, dfx.ForwardMode())[0])(POINT)
+
+
+class Learned(nsjax.System):
+    """A mass on a belt whose friction force over the relative velocity is a small network."""
+
+    law: eqx.nn.MLP
+    v_dr: float = 0.3
+
+    def vector_field(self, t, y, s):
+        relative = y.v - self.v_dr
+        return Motion(y.v, -y.x - s.belt * jax.nn.softplus(self.law(relative**2)))
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y.v - self.v_dr
+
+
+def test_many_parameters():
+    """A network's friction law is fitted to a trajectory with stick phases: the loss falls a hundredfold."""
+    ts = jnp.linspace(0.5, 10.0, 20)
+
+    def path(system):
+        saveat = dfx.SaveAt(ts=ts)
+        sol = solve(
+            system, 0.0, 10.0, Motion(1.5, 0.0), saveat=saveat, adjoint=dfx.RecursiveCheckpointAdjoint(), **CHEAP
+        )
+        return sol.ys.x, sol.modes
+
+    class Truth(Learned):
+        def vector_field(self, t, y, s):
+            relative = y.v - self.v_dr
+            return Motion(y.v, -y.x - s.belt * (0.4 + 0.6 / (1 + 3 * relative**2)))
+
+    law = eqx.nn.MLP("scalar", "scalar", 8, 1, jax.nn.tanh, key=jax.random.key(1))
+    data, modes = eqx.filter_jit(path)(Truth(law))
+    assert np.any(modes == 0) and np.any(modes == -1)
+
+    def loss(law):
+        return jnp.mean((path(Learned(law))[0] - data) ** 2)
+
+    @eqx.filter_jit
+    def step(law, m, v, i):
+        value, g = eqx.filter_value_and_grad(loss)(law)
+        m = jax.tree.map(lambda m, g: 0.8 * m + 0.2 * g, m, g)
+        v = jax.tree.map(lambda v, g: 0.95 * v + 0.05 * g**2, v, g)
+        rate = 0.05 / (1 + 0.02 * i)
+        law = eqx.apply_updates(law, jax.tree.map(lambda m, v: -rate * m / (jnp.sqrt(v) + 1e-9), m, v))
+        return value, law, m, v
+
+    zeros = jax.tree.map(jnp.zeros_like, eqx.filter(law, eqx.is_inexact_array))
+    m = v = zeros
+    values = []
+    for i in range(150):
+        value, law, m, v = step(law, m, v, jnp.asarray(float(i)))
+        values.append(float(value))
+    assert len(jax.tree.leaves(zeros)) == 4 and min(values) < 1e-2 * values[0], values
