@@ -105,7 +105,7 @@ def test_no_multiplier_where_nothing_slides():
     t, y = jnp.zeros(()), Motion(jnp.ones(()), jnp.ones(()))
 
     def slots(system):
-        return [(s.switch, s.sliding) for s in Model(system, jnp.ones(()), t, y).slots]
+        return [(s.switch, s.holding) for s in Model(system, jnp.ones(()), t, y).slots]
 
     assert slots(Free()) == []
     assert slots(Crossing()) == [(0, False)] == slots(Idle())
