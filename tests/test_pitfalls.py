@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import reference
 from jax import Array
-from models import flat, itinerary, Motion, Point, times
+from models import flat, itinerary, Motion, Point, times, Toggle
 from scipy.linalg import expm
 from scipy.optimize import brentq
 from test_cost import count
@@ -292,21 +292,6 @@ def test_steep_surface(steepness):
     sol = solve(Steep(steepness=steepness), 0.0, 30.0, Motion(2.5, -0.5), max_steps=20_000)
     np.testing.assert_allclose(times(sol), [float(e.t) for e in ref.events], atol=1e-6)
     np.testing.assert_allclose(flat(sol.y1), reference.floats(ref.y), atol=1e-6)
-
-
-class Toggle(nsjax.System):
-    """x'' = -a sgn(x - c): parabolas of length 2 v / a, on which solve is exact, joined on the surface. (Rounding grows
-    with the square of their number.)"""
-
-    a: float = 1.0
-    c: float = 0.0
-
-    def vector_field(self, t, y, s):
-        return Motion(y.v, -self.a * s.side)
-
-    @nsjax.sgn
-    def side(self, t, y):
-        return y.x - self.c
 
 
 @functools.cache
