@@ -16,7 +16,16 @@ def single(tree):
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)
 
 
-@pytest.mark.parametrize("key", gallery.THESIS)
+# After a long stick the next step is so long that a cubic field overflows in it; the controller's next one is NaN.
+OVERFLOW = pytest.mark.xfail(strict=True, reason="a step that overflows is followed by one of length NaN")
+QUICK = ("1.1(3)", "example 2.2", "3.4", "6.7", "6.8", "6.9")
+
+
+def marked(key):
+    return pytest.param(key, marks=[OVERFLOW] * (key == "6.9") + [pytest.mark.slow] * (key not in QUICK))
+
+
+@pytest.mark.parametrize("key", [marked(key) for key in gallery.THESIS])
 def test_gallery_in_single_precision(key):
     """Pitfalls 1, 3: every system has the same events as in double precision, none twice, and nothing falls through."""
     entry = gallery.THESIS[key]
@@ -41,11 +50,10 @@ def test_gallery_in_single_precision(key):
         assert np.all(np.diff(at) > 4 * np.spacing(np.float32(at[1:])))
 
 
-@pytest.mark.parametrize("bounces", [9])
-def test_ball_in_single_precision(bounces):
+def test_ball_in_single_precision():
     """Pitfall 4: it does not fall through the floor, between events either."""
     ball = reference.bouncing_ball(3.5)
-    assert len(ball.impact_times) == bounces
+    assert len(ball.impact_times) == 9
     system, y0 = single(gallery.BouncingBall()), single(Motion(1.0, 0.0))
     sol = solve(system, 0.0, 3.5, y0, dt0=1e-2, saveat=dfx.SaveAt(dense=True))
     np.testing.assert_allclose(times(sol), ball.impact_times, atol=1e-5)
@@ -103,6 +111,16 @@ def test_time_that_cannot_advance():
     """Pitfall 28: at t = 1e8 a unit in the last place of single precision is 8: told, not looped on."""
     sol = solve(single(gallery.StickSlip()), 1e8, 1e8 + 64, single(Motion(2.5, -0.5)), throw=False)
     assert sol.result in (RESULTS.dt_min_reached, RESULTS.max_steps_reached)
+
+
+@OVERFLOW
+def test_step_that_overflows():
+    """Pitfalls 11, 28: after a stick of 1500 the first step is tried with a length of thousands, in which a cubic field
+    overflows; it is to be rejected like any other."""
+    system = gallery.ForcedStickSlip(v_dr=1e-3, f_0=0.0)
+    sol = solve(system, 0.0, 4000.0, Motion(0.0, 1e-3), throw=False)
+    assert sol.result == RESULTS.successful and len(sol.events) >= 2
+    np.testing.assert_allclose(times(sol)[0], 1500.0, rtol=1e-6)
 
 
 # Units.
