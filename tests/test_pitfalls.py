@@ -264,6 +264,43 @@ def test_stack_of_surfaces():
     assert harder >= 5
 
 
+class Released(nsjax.System):
+    """v' = p t - A Sgn(v) with A = [[2, c], [c, 1.5]] and p = A (1, side): from rest λ = t (1, side), so that both
+    surfaces are left at t = 1; then v = p (t - 1)² / 2."""
+
+    c: float
+    side: float
+
+    @property
+    def A(self):
+        return jnp.stack([jnp.stack([2 + 0 * self.c, self.c]), jnp.stack([self.c, 1.5 + 0 * self.c])])
+
+    @property
+    def p(self):
+        return self.A @ jnp.stack([1 + 0 * self.side, self.side])
+
+    @property
+    def switches(self):
+        return tuple(nsjax.sgn(lambda self, t, y, i=i: y.x[i], name=f"s{i}") for i in (0, 1))
+
+    def vector_field(self, t, y, s):
+        return Point(self.p * t - self.A @ jnp.stack([s.s0, s.s1]))
+
+
+@TOGETHER
+def test_two_surfaces_left_at_one_instant():
+    """Pitfalls 7, 13: also where the friction forces depend on one another."""
+    c, side = map(jnp.ravel, jnp.meshgrid(jnp.asarray([0.0, 0.5, -0.5, 0.9, -0.9]), jnp.asarray([1.0, -1.0])))
+
+    def run(c, side):
+        system = Released(c, side)
+        return solve(system, 0.0, 2.0, Point(jnp.zeros(2)), throw=False), system.p
+
+    sol, p = jax.jit(jax.vmap(run))(c, side)
+    assert np.all(sol.result == RESULTS.successful) and np.all(sol.events.num <= 2)
+    np.testing.assert_allclose(sol.y1.x, p / 2, atol=1e-12)
+
+
 # One surface.
 
 
