@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from diffrax._root_finder import use_stepsize_tol
+from jax.core import Tracer
 
 from ._structure import is_affine, is_constant
 from ._system import impact, relay, sgn, System
@@ -102,7 +103,7 @@ def _controller(controller: Any, dtype: Any) -> dfx.AbstractStepSizeController:
     # A step of size one is rounded by about eps; its error estimate by a few times that. (Inside `jit` the
     # tolerance may have no value yet.)
     least = 8 * eps
-    known = eqx.is_array_like(rtol) and not isinstance(rtol, jax.core.Tracer)
+    known = eqx.is_array_like(rtol) and not isinstance(rtol, Tracer)
     if known and 0 < float(rtol) < least:
         cure = (
             "Call `jax.config.update('jax_enable_x64', True)` and pass float64 values, or loosen the tolerance."
