@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from diffrax._root_finder import use_stepsize_tol
+from jax.core import Tracer
 
 from ._structure import is_affine, is_constant
 from ._system import impact, relay, sgn, System
@@ -99,15 +100,19 @@ def _controller(controller: Any, dtype: Any) -> dfx.AbstractStepSizeController:
             f"`diffrax.PIDController(rtol=1e-8, atol=1e-8)`, but got {controller!r}."
         )
     rtol = getattr(controller, "rtol", None)
-    if isinstance(rtol, (int, float)) and 0 < rtol < 4 * eps:
+    # A step of size one is rounded by about eps; its error estimate by a few times that. (Inside `jit` the
+    # tolerance may have no value yet.)
+    least = 8 * eps
+    known = eqx.is_array_like(rtol) and not isinstance(rtol, Tracer)
+    if known and 0 < float(rtol) < least:
         cure = (
             "Call `jax.config.update('jax_enable_x64', True)` and pass float64 values, or loosen the tolerance."
             if eps > 1e-10
             else "Loosen the tolerance."
         )
         raise ValueError(
-            f"Argument `stepsize_controller` must have a tolerance that {dtype} can hold (rtol >= {4 * eps:.1e}), but "
-            f"got rtol = {rtol:.1e}. {cure}"
+            f"Argument `stepsize_controller` must have a tolerance that {dtype} can hold (rtol >= {least:.1e}), but "
+            f"got rtol = {float(rtol):.1e}. {cure}"
         )
     return controller
 

@@ -149,6 +149,21 @@ class Belt(nsjax.System):
         return self.F_stick / self.F_slip
 
 
+class Toggle(nsjax.System):
+    """x'' = -a sgn(x - c): parabolas of length 2 v / a, on which solve is exact, joined on the surface. (Rounding grows
+    with the square of their number.)"""
+
+    a: float = 1.0
+    c: float = 0.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -self.a * s.side)
+
+    @nsjax.sgn
+    def side(self, t, y):
+        return y.x - self.c
+
+
 class Signs(NamedTuple):
     z: Array  # integrals of the three switch values
     q: Array  # the third guard, as a state

@@ -41,6 +41,43 @@ def derivative(fn: Callable[..., Sequence], *at: float, h: float = 1e-13) -> np.
     return floats(columns).T
 
 
+def second_derivative(fn: Callable[..., Sequence], *at: float, h: float = 1e-10) -> np.ndarray:
+    """d² fn / d at², of shape (len(fn), len(at), len(at)), by central differences in 40 digits; error about 1e-20."""
+    h, at = mp.mpf(h), [mp.mpf(a) for a in at]
+
+    def shifted(i: int, a: int, j: int, b: int) -> Sequence:
+        return fn(*(x + h * (a * (k == i) + b * (k == j)) for k, x in enumerate(at)))
+
+    n = range(len(at))
+    signs = [(1, 1), (1, -1), (-1, 1), (-1, -1)]
+    rows = [[[[a * b * y for y in shifted(i, a, j, b)] for a, b in signs] for j in n] for i in n]
+    return np.moveaxis(floats([[[sum(y) / (4 * h * h) for y in zip(*four)] for four in row] for row in rows]), -1, 0)
+
+
+def crossing_flow(t1: Any, x0: Any, v0: Any, a: Any, c: Any) -> list:
+    """x'' = -a sgn(x - c) from x0 > c until t1 before the second crossing: (x, v, time of the first crossing)."""
+    root = mp.sqrt(v0**2 + 2 * a * (x0 - c))
+    t = (v0 + root) / a
+    tau = mp.mpf(t1) - t
+    return [c - root * tau + a * tau**2 / 2, -root + a * tau, t]
+
+
+def sliding_flow(t1: Any, x0: Any, v0: Any, w: Any, F: Any, b: Any) -> list:
+    """x'' = w t - F Sgn(x'), breakaway b, from v0 > 0: slips to rest, sticks while w t <= b F, and slips again:
+    (x, v, start and end of stick). For b = 1 the end of stick is tangential; the derivative by b is one-sided then."""
+    t1, start, end = mp.mpf(t1), (F - mp.sqrt(F**2 - 2 * w * v0)) / w, b * F / w
+    rest, tau = x0 + v0 * start + w * start**3 / 6 - F * start**2 / 2, t1 - end
+    return [rest + w * tau**3 / 6 + (b - 1) * F * tau**2 / 2, w * tau**2 / 2 + (b - 1) * F * tau, start, end]
+
+
+def impact_flow(t1: Any, x0: Any, v0: Any, g: Any, e: Any) -> list:
+    """A ball until t1 between its first and second impact: (x, v, time of the impact)."""
+    V = mp.sqrt(v0**2 + 2 * g * x0)
+    t = (v0 + V) / g
+    tau = mp.mpf(t1) - t
+    return [e * V * tau - g * tau**2 / 2, e * V - g * tau, t]
+
+
 @dataclass(frozen=True)
 class ExpSum:
     """g(τ) = p0 + p1 τ + p2 τ² + Re Σ a exp(λ τ) for τ >= 0."""
@@ -97,8 +134,13 @@ class ExpSum:
     def _polish(self, a: Any, b: Any, ga: Any) -> Any:
         """Newton's method on a bracket that holds exactly one simple root."""
         tau = (a + b) / 2
+        noise = (
+            100 * mp.eps * self.bound(0, b)
+        )  # of g by rounding: the flatter g, the farther apart Newton's last steps
         for _ in range(200):
             g = self(tau)
+            if abs(g) < noise:
+                return tau - g / self(tau, 1)
             a, b = (tau, b) if g * ga > 0 else (a, tau)
             new = tau - g / self(tau, 1)
             new = new if a <= new <= b else (a + b) / 2
@@ -499,6 +541,94 @@ def bouncing_ball(t: float, x0: float = 1.0, v0: float = 0.0, g: float = 9.81, e
     v = u - g * tau
     dy = [dx + u * dtau + tau * du - g * tau * dtau - tau**2 / 2 * d_g, du - g * dtau - tau * d_g]
     return Ball(np.array([x + u * tau - g * tau**2 / 2, v]), np.array(times), np.array(dy), float(accumulation))
+
+
+class Accumulation(NamedTuple):
+    """The time at which a bouncing ball comes to rest, and its derivatives by (x0, v0, g, e)."""
+
+    t: Any
+    derivative: tuple[Any, Any, Any, Any]
+
+
+def bouncing_ball_accumulation(x0: Any = 1.0, v0: Any = 0.0, g: Any = 9.81, e: Any = 0.8) -> Accumulation:
+    """t = (v0 + V (1 + e) / (1 - e)) / g with V = sqrt(v0² + 2 g x0), in 40 digits.
+
+    The first impact is at t_1 = (v0 + V) / g with velocity V; its flights last 2 V e^n / g, so that
+    t = t_1 + (2 V / g) (e + e² + ...) = t_1 + 2 V e / (g (1 - e))."""
+    x0, v0, g, e = (mp.mpf(p) for p in (x0, v0, g, e))
+    V, ratio = mp.sqrt(v0**2 + 2 * g * x0), (1 + e) / (1 - e)
+    t = (v0 + V * ratio) / g
+    return Accumulation(
+        t, (ratio / V, (1 + v0 / V * ratio) / g, x0 * ratio / (V * g) - t / g, 2 * V / (g * (1 - e) ** 2))
+    )
+
+
+class TableBall(NamedTuple):
+    """Times of a ball on an oscillating table, and its velocities (not relative to the table)."""
+
+    first_impact: Any
+    first_velocity: Any  # before it
+    impacts: list[Any]  # times of those that are told apart, up to flights of 1e-30
+    accumulation: Any  # rest begins
+    lift_off: Any  # rest ends, None where it never does
+    lift_off_velocity: Any
+    next_impact: Any
+    next_velocity: Any  # before it
+
+
+def ball_on_table(a: Any = 1.2, w: Any = 1.0, g: Any = 1.0, e: Any = 0.4, gap: Any = 0.5, v0: Any = 0.0) -> TableBall:
+    """x'' = -g above a table at a cos(w t), restitution e, from x = a + gap and velocity v0 at t = 0.
+
+    It bounces, its impacts accumulate, it rests on the table while the contact force (for a unit mass)
+    g - a w² cos(w t) is positive, lifts off where that vanishes, flies and lands again. Flight by flight in 90 digits;
+    beyond flights of 1e-30, where gravity is constant, the rest of the geometric series."""
+    with mp.workdps(90):
+        a, w, g, e, gap, v0 = (mp.mpf(p) for p in (a, w, g, e, gap, v0))
+
+        def flight(t: Any, height: Any, u: Any) -> ExpSum:
+            """The gap from time t on, from a gap `height` and relative velocity u."""
+            phase = mp.expj(w * t)
+            linear = (height + a * phase.real, u - a * w * phase.imag, -g / 2)
+            return ExpSum(linear, ((-a * phase, mp.mpc(0, w)),))
+
+        def pull(t: Any) -> Any:
+            return g - a * w**2 * mp.cos(w * t)  # -h''
+
+        def table(t: Any) -> Any:
+            return -a * w * mp.sin(w * t)
+
+        long = 10 * mp.pi / w + 10 * (abs(v0) + mp.sqrt(2 * g * gap) + a * w) / g
+        arc = flight(mp.zero, gap, v0)
+        t = first = arc.first_root(long)
+        u, impacts = arc(t, 1), [t]
+        velocity = u + table(t)
+        while True:
+            u, arc = -e * u, flight(t, mp.zero, -e * u)
+            guess = 2 * u / pull(t)
+            if guess > mp.mpf("1e-4"):
+                tau = arc.first_root(long)
+            elif pull(t) <= 0:
+                raise ValueError("The table falls away faster than the ball where its impacts accumulate.")
+            elif guess < mp.mpf("1e-30"):
+                break
+            else:  # h'' changes by one part in ten thousand at most: Newton's method from the root of the parabola
+                tau = guess
+                for _ in range(8):
+                    tau = tau - arc(tau) / arc(tau, 1)
+            t, u = t + tau, arc(tau, 1)
+            impacts.append(t)
+        t = t + guess / (1 - e)
+        if pull(t) < 0:
+            raise ValueError("The table falls away faster than the ball where its impacts accumulate.")
+        if g >= a * w**2:
+            return TableBall(first, velocity, impacts, t, None, None, None, None)
+        turns = mp.ceil((w * t + mp.acos(g / (a * w**2))) / (2 * mp.pi))
+        leave = (2 * mp.pi * turns - mp.acos(g / (a * w**2))) / w
+        arc = flight(leave, mp.zero, mp.zero)
+        land = arc.first_root(long)
+        return TableBall(
+            first, velocity, impacts, t, leave, table(leave), leave + land, arc(land, 1) + table(leave + land)
+        )
 
 
 def _horner(series: list, tau: Any) -> Any:

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from models import Hammer, Motion, Pair, pid, Plane
+from models import Hammer, Motion, Pair, pid, Plane, Toggle
 
+import nsjax
 from nsjax import gallery, solve
 
 
@@ -154,6 +155,75 @@ def test_second_derivatives():
     found = jax.jit(jax.jacfwd(jax.jacfwd(final)))(jnp.asarray(at))
     print(np.abs(found - want).max(), np.abs(want).max())
     np.testing.assert_allclose(found, want, atol=1e-5 * np.abs(want).max())
+
+
+class Ramp(nsjax.System):
+    """x'' = w t - F Sgn(x'), breakaway b: `reference.sliding_flow`."""
+
+    w: float = 0.8
+    F: float = 1.5
+    b: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, self.w * t - self.F * s.rub)
+
+    @nsjax.sgn
+    def rub(self, t, y):
+        return y.v
+
+    @rub.breakaway
+    def rub(self):
+        return self.b
+
+
+def ramp(p):
+    return Ramp(w=p[2], F=p[3], b=p[4])
+
+
+FLOWS = {
+    "crossing": (reference.crossing_flow, lambda p: Toggle(a=p[2], c=p[3]), (0.8, 0.3, 1.1, 0.2), 1),
+    "sliding": (reference.sliding_flow, ramp, (0.1, 0.7, 0.8, 1.5, 1.0), 2),
+    "breakaway": (reference.sliding_flow, ramp, (0.1, 0.7, 0.8, 1.5, 1.3), 2),
+    "impact": (reference.impact_flow, lambda p: gallery.BouncingBall(g=p[2], e=p[3]), (0.9, 0.4, 1.2, 0.7), 1),
+}
+
+
+@functools.cache
+def second(system, events):
+    def final(p):
+        sol = solve(system(p), 0.0, 3.0, Motion(p[0], p[1]), solver=dfx.Bosh3(), stepsize_controller=pid(1e-6))
+        return jnp.stack([*sol.y1, *sol.events.t[:events]])
+
+    def first(p):
+        out = final(p)
+        return out, out
+
+    def both(p):
+        jacobian, out = jax.jacfwd(first, has_aux=True)(p)
+        return jacobian, (out, jacobian)
+
+    return jax.jit(jax.jacfwd(both, has_aux=True))
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_second_derivatives_by_closed_forms(name):
+    """Pitfall 20: through a crossing, the start and the end of sliding, static breakaway, an impact; and of the times of
+    events. The solutions are polynomials of time, on which the solver is exact."""
+    flow, system, at, events = FLOWS[name]
+
+    def exact(*p):
+        return flow(3.0, *p)
+
+    hessian, (value, jacobian) = second(system, events)(jnp.asarray(at))
+    for found, want, tol in (
+        (value, reference.floats(exact(*map(reference.mp.mpf, at))), 1e-10),
+        (jacobian, reference.derivative(exact, *at), 1e-8),
+        (hessian, reference.second_derivative(exact, *at), 1e-6),
+    ):
+        if name == "sliding":  # b = 1 is the least it may be
+            found, want = (np.asarray(a)[(..., *[slice(4)] * (a.ndim - 1))] for a in (found, want))
+        print(name, np.abs(found - want).max(), np.abs(want).max())
+        np.testing.assert_allclose(found, want, rtol=tol, atol=tol)
 
 
 def test_two_surfaces():

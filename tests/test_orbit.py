@@ -124,6 +124,7 @@ def test_solution_over_several_periods(classic):
     ],
 )
 def test_not_the_orbit_asked_for(parameters, y0, period, result):
+    """Pitfall 26: ends in an equilibrium, or goes round more than once; both are told."""
     system = gallery.StickSlip(**parameters)
     orbit = find_orbit(system, Motion(*y0), period=period, throw=False, **METHOD)
     assert orbit.result == result

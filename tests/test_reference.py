@@ -148,6 +148,28 @@ def test_stick_slip_derivative_by_extended_saltation_product(c, y0, t1):
     assert result.derivative[:, :2] == pytest.approx(ref.floats(path.fundamental), rel=1e-13, abs=1e-13)
 
 
+# Flow maps in closed form
+
+
+@pytest.mark.parametrize(
+    "flow, at",
+    [
+        (ref.crossing_flow, (0.8, 0.3, 1.1, 0.2)),
+        (ref.sliding_flow, (0.1, 0.7, 0.8, 1.5, 1.0)),
+        (ref.sliding_flow, (0.1, 0.7, 0.8, 1.5, 1.3)),
+        (ref.impact_flow, (0.9, 0.4, 1.2, 0.7)),
+    ],
+)
+def test_second_derivatives_by_two_routes(flow, at):
+    """Central differences against `mpmath.diff`, component by component."""
+    second = ref.second_derivative(lambda *p: flow(3.0, *p), *at)
+    assert second == pytest.approx(second.transpose(0, 2, 1), abs=1e-15)
+    point = tuple(map(mp.mpf, at))
+    for i, j, k in [(0, 1, 1), (1, 1, 2), (1, 3, 3), (2, 2, 1), (0, 0, 3)]:
+        order = tuple((j == n) + (k == n) for n in range(len(at)))
+        assert second[i, j, k] == pytest.approx(float(mp.diff(lambda *p: flow(3.0, *p)[i], point, order)), abs=1e-9)
+
+
 # Section 6.7
 
 
@@ -256,6 +278,68 @@ def test_bouncing_ball(t, x0, v0):
     )
     with pytest.raises(ValueError, match="at rest"):
         ref.bouncing_ball(ball.accumulation + 1e-9, x0, v0)
+
+
+@pytest.mark.parametrize("e", [0.8, 0.999])
+def test_accumulation_of_the_bouncing_ball(e):
+    """The closed form against the sum of the flights, the same function in double precision, and differences."""
+    at = dict(x0=1.3, v0=0.4, g=9.81, e=e)
+    exact = ref.bouncing_ball_accumulation(**at)
+    V = mp.sqrt(mp.mpf(0.4) ** 2 + 2 * mp.mpf(9.81) * mp.mpf(1.3))
+    flights = mp.nsum(lambda n: 2 * V * mp.mpf(e) ** n / mp.mpf(9.81), [1, mp.inf])
+    assert abs(exact.t - (mp.mpf(0.4) + V) / mp.mpf(9.81) - flights) < 1e-25
+    assert float(exact.t) == pytest.approx(ref.bouncing_ball(0.1, **at).accumulation, rel=1e-13)
+    found = ref.derivative(lambda *p: [ref.bouncing_ball_accumulation(*p).t], *at.values())
+    assert found[0] == pytest.approx(ref.floats(exact.derivative), rel=1e-15)
+
+
+def test_ball_on_table():
+    """Against DOP853 as long as impacts can be told apart, the contact force, and a table at rest."""
+    ball = ref.ball_on_table()
+    t, y, impacts = 0.0, np.array([1.7, 0.0]), []
+
+    def gap(t, y):
+        return y[0] - 1.2 * np.cos(t)
+
+    gap.terminal, gap.direction = True, -1
+    for _ in range(4):
+        sol = solve_ivp(
+            lambda t, y: [y[1], -1.0], (t, 40), y, method="DOP853", rtol=1e-12, atol=1e-13, events=gap, max_step=0.02
+        )
+        t, (_, v) = sol.t[-1], sol.y[:, -1]
+        impacts.append(t)
+        y = np.array([1.2 * np.cos(t), -1.2 * np.sin(t) - 0.4 * (v + 1.2 * np.sin(t))])
+    assert impacts == pytest.approx(ref.floats(ball.impacts[:4]), abs=1e-9)
+    assert 0 < ball.accumulation - ball.impacts[30] < 1e-12
+    assert ball.first_impact == ball.impacts[0] and abs(ball.first_velocity + ball.first_impact) < 1e-35
+    # Rest ends where gravity just holds the ball: 1.2 cos t = 1 and rising.
+    assert ball.accumulation < ball.lift_off < ball.next_impact
+    assert np.cos(float(ball.lift_off)) == pytest.approx(1 / 1.2) and ball.lift_off_velocity > 0
+    flight = np.linspace(float(ball.lift_off), float(ball.next_impact), 1001)
+    tau = flight - flight[0]
+    height = 1.2 * np.cos(flight[0]) + float(ball.lift_off_velocity) * tau - tau**2 / 2 - 1.2 * np.cos(flight)
+    assert np.all(height[1:-1] > 0) and abs(height[-1]) < 1e-14
+    assert float(ball.next_velocity) == pytest.approx(float(ball.lift_off_velocity) - tau[-1], abs=1e-15)
+    still = ref.ball_on_table(a=0, g=9.81, e=0.8, gap=1.3, v0=0.4)
+    assert abs(still.accumulation - ref.bouncing_ball_accumulation(1.3, 0.4, 9.81, 0.8).t) < 1e-35
+    assert still.lift_off is None
+
+
+@pytest.mark.parametrize("e, t1, impacts", [(0.7, 5.0, 7), (0.85, 40.0, 20)])
+def test_impacts_with_flat_roots(e, t1, impacts):
+    """Slow impacts, whose roots rounding makes the less certain: Newton's method ends all the same. A start between any
+    two of them goes on alike, and the wall is never passed."""
+    system = ref.ImpactOscillator(e=e)
+    path = ref.simulate(system, t1, (1.0, 0.0))
+    assert len(path.events) == impacts
+    for a, b in zip(path.events, path.events[1:]):
+        assert abs(a.x - mp.mpf(0.5)) == 0 and a.v > 0
+        arc = system.oscillator(0).arc(a.t, a.x, a.v)
+        assert abs(arc(b.t - a.t) - mp.mpf(0.5)) < 1e-35
+        assert all(arc((b.t - a.t) * k / 20) > 0.5 for k in range(1, 20))
+    middle = (path.events[-1].t + path.events[-2].t) / 2
+    again = ref.simulate(system, t1, ref.simulate(system, middle, (1.0, 0.0)).y, t0=middle)
+    assert max(abs(p - q) for p, q in zip(again.y, path.y)) < 1e-30
 
 
 def test_impact_oscillator():
