@@ -315,9 +315,9 @@ class _Exact:
         are brought up to date."""
         rate = self.case.G[k] @ self.base  # h' = rate . z: nothing but velocities
         push = self.D[:, k]
-        R = np.eye(self.size) - (1 + self.case.e[k - self.shape.sgn - self.shape.relay]) * np.outer(
-            push, rate
-        ) / (rate @ push)
+        R = np.eye(self.size) - (1 + self.case.e[k - self.shape.sgn - self.shape.relay]) * np.outer(push, rate) / (
+            rate @ push
+        )
         after = R @ z
         toggled = []
         for j, kind in enumerate(self.kinds):
@@ -423,7 +423,7 @@ def solve(case: Case, shape: Shape, max_events: int = 40) -> Trajectory | None:
             return exact.run(t1, max_events, cut)
         except Sensitive as problem:
             cut = problem.args[0]
-            t1 = problem.args[1] - 10 ** -1.5
+            t1 = problem.args[1] - 10**-1.5
             if t1 < 0.1:
                 return None
     return None

@@ -20,10 +20,10 @@ import nsjax
 
 # One compiled program each.
 SHAPES = {
-    "friction": (Shape(2, 1, 0, 0, forced=True, moving=False), dfx.Dopri8()),
+    "friction": (Shape(2, 1, 0, 0, forced=True, moving=False), dfx.Tsit5()),
     "corners": (Shape(4, 3, 0, 0, forced=True, moving=True), dfx.Tsit5()),
-    "relays": (Shape(3, 2, 1, 0, forced=False, moving=False), dfx.Tsit5()),
-    "bounce": (Shape(2, 0, 1, 1, forced=True, moving=True), dfx.Dopri8()),
+    "relays": (Shape(3, 2, 1, 0, forced=False, moving=False), dfx.Dopri8()),
+    "bounce": (Shape(2, 0, 1, 1, forced=True, moving=True), dfx.Tsit5()),
     "walls": (Shape(4, 1, 1, 2, forced=True, moving=False), dfx.Tsit5()),
     "all": (Shape(6, 3, 2, 1, forced=False, moving=False), dfx.Tsit5()),
 }
@@ -158,3 +158,53 @@ def fuzz(name: str, count: int, seed: int, derive: bool) -> tuple[collections.Co
         if difference:
             wrong.append((name, seed, i, difference))
     return tally, wrong
+
+
+def report(tally: collections.Counter, wrong: list) -> None:
+    print("\n" + ", ".join(f"{key}: {number}" for key, number in tally.items()))
+    total = tally["agreed"] + tally["told"] + tally["sensitive"] + tally["wrong"]
+    assert not wrong
+    assert tally["sensitive"] <= 0.02 * total
+    # With strong coupling of switches the search for a mode may fail, but it says so.
+    assert tally["needlessly told"] == tally["needlessly told ambiguous"] <= 0.1 * total
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_random_systems(name):
+    report(*fuzz(name, 60, 0, derive=name in ("friction", "bounce")))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SHAPES)
+def test_many_random_systems(name):
+    """About 20,000 systems in all."""
+    tally, wrong = collections.Counter(), []
+    for seed in range(1, 10):
+        more, bad = fuzz(name, 400, seed, derive=False)
+        tally, wrong = tally + more, wrong + bad
+    report(tally, wrong)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SHAPES)
+def test_derivatives_of_random_systems(name):
+    report(*fuzz(name, 400, 10, derive=True))
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_the_oracle_against_itself(name):
+    """Its derivatives, by saltation matrices, are those of its solutions."""
+    shape, rng = SHAPES[name][0], np.random.default_rng(0)
+    compared = 0
+    for _ in range(12):
+        case = exact.generate(rng, shape)
+        truth = exact.solve(case, shape, MAX_EVENTS)
+        if truth is None or truth.ends or truth.gain > 1e3:
+            continue
+        step = 1e-5 * rng.normal(size=shape.n) / truth.gain
+        ends = [exact.solve(case._replace(y0=case.y0 + s * step, t1=truth.t1), shape, MAX_EVENTS) for s in (1, -1)]
+        if all(end is not None and not end.cut and len(end.t) == len(truth.t) for end in ends):
+            slope = (ends[0].y1 - ends[1].y1) / 2
+            np.testing.assert_allclose(slope, truth.jacobian @ step, atol=1e-3 * np.linalg.norm(step), rtol=1e-3)
+            compared += 1
+    assert compared > 5
