@@ -1,0 +1,429 @@
+"""Random piecewise-affine systems, and their solutions by matrix exponentials: an oracle that shares nothing with nsjax.
+
+With z = (y, 1, cos ωt, sin ωt) every mode is z' = M z, multipliers are rows times z, and so is every guard. Its first
+root is found from Taylor polynomials with a bound on their curvature, so that none can be missed.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import expm
+
+
+EPS = 1e-7  # how near to a tangency, or to another event, a guard may come before the case is called sensitive
+DEGREE = 26  # of the Taylor polynomials, on steps with |M| h = 1.5: the remainder is below 1e-23
+CROWDED = 1e-6  # the shortest time between events
+FLIGHT = 1e-4  # the shortest flight between impacts
+GAIN = 1e6  # the largest amplification of errors
+
+
+class Shape(NamedTuple):
+    n: int  # states; with impacts the first are positions, then as many velocities
+    sgn: int
+    relay: int
+    impact: int
+    forced: bool  # whether the field depends on time
+    moving: bool  # whether the surfaces do
+
+    @property
+    def switches(self) -> int:
+        return self.sgn + self.relay + self.impact
+
+
+class Case(NamedTuple):
+    """y' = F z + D s with s in the order sgn, relay, impact; h = G z, and `off` z for the way back of the relays."""
+
+    F: np.ndarray  # (n, n + 3)
+    D: np.ndarray  # (n, switches)
+    G: np.ndarray  # (switches, n + 3)
+    off: np.ndarray  # (relays, n + 3)
+    bound: np.ndarray  # (sgn,)
+    e: np.ndarray  # (impacts,)
+    omega: np.ndarray
+    y0: np.ndarray
+    t1: np.ndarray
+
+
+class Trajectory(NamedTuple):
+    t1: float
+    t: np.ndarray  # (events,)
+    switch: np.ndarray  # (events,)
+    modes: np.ndarray  # (events, switches), after each
+    y1: np.ndarray
+    mode1: np.ndarray
+    jacobian: np.ndarray
+    gain: float  # how much an error made on the way, or in an event time, may grow until t1
+    gains: np.ndarray  # the same for the time of each event
+    ends: str  # "" at t1; else "no mode": no assignment of stick and slip satisfies the laws at the last event
+    cut: str  # why t1 was moved before an event that is too sensitive
+
+
+class Sensitive(Exception):
+    """The solution here depends on digits that a numerical method does not have."""
+
+
+class Unsolvable(Exception):
+    """No assignment of stick and slip is consistent."""
+
+
+def generate(rng: np.random.Generator, shape: Shape) -> Case:
+    """A random case: half of them with little coupling of the switches, a few surfaces repulsive, b > 1 for half."""
+    n, (m, r, c) = shape.n, shape[1:4]
+    width = n + 3
+    F, D, G = np.zeros((n, width)), np.zeros((n, m + r + c)), np.zeros((m + r + c, width))
+    pairs = n // 2 if c else 0
+    free = slice(pairs, n)  # equations of motion are second order: what acts, acts on velocities
+    A = rng.normal(size=(n, n)) * rng.choice([0.3, 1.0]) / np.sqrt(n) - rng.uniform(0.1, 1) * np.eye(n)
+    if pairs:
+        A[free, :pairs] -= np.diag(rng.uniform(0.5, 8, pairs))[: n - pairs]
+        A[:pairs] = 0
+        A[:pairs, pairs : 2 * pairs] = np.eye(pairs)
+    elif n > 1 and rng.random() < 0.7:  # something that turns
+        A[0, 1] += rng.uniform(1, 4)
+        A[1, 0] -= rng.uniform(1, 4)
+    F[:, :n] = A
+    F[free, n] = rng.normal(size=n - pairs)
+    if shape.forced:
+        F[free, n + 1 :] = rng.normal(size=(n - pairs, 2)) * rng.uniform(0.2, 3)
+    coupling = rng.choice([0.2, 1.0])
+    for k in range(m + r):
+        normal = rng.normal(size=n) * (rng.random(n) < 0.6)
+        normal[pairs + rng.integers(n - pairs)] = rng.choice([-1, 1]) * rng.uniform(0.5, 2)
+        G[k, :n], G[k, n] = normal, 0.5 * rng.normal()
+        if shape.moving:
+            G[k, n + 1 :] = 0.5 * rng.normal(size=2)
+        push = coupling * rng.normal(size=n)
+        if k < m:
+            push -= rng.uniform(0.5, 2) * normal / (normal[free] @ normal[free])
+            if normal[free] @ push[free] > 0 and rng.random() < 0.8:
+                push = -push
+        D[free, k] = push[free] * (1 if k < m else 3)
+    off = -G[m : m + r].copy()
+    off[:, n] -= rng.uniform(0.3, 1.5, r)
+    weight = rng.uniform(0.5, 2, pairs)
+    for k in range(m + r, m + r + c):
+        normal = np.zeros(pairs)
+        normal[(k - m - r) % pairs] = rng.choice([-1, 1])
+        if rng.random() < 0.3 and pairs > 1:
+            normal[(k - m - r + 1) % pairs] = rng.choice([-1, 1]) * rng.uniform(0.3, 1)
+        G[k, :pairs], G[k, n] = normal, rng.uniform(0.2, 1)
+        if shape.moving:
+            G[k, n + 1 :] = 0.15 * rng.normal(size=2)
+        D[pairs : 2 * pairs, k] = normal * weight
+    y0 = rng.normal(size=n)
+    if pairs:
+        y0[:pairs] *= 0.1
+        for k in range(m + r, m + r + c):  # inside, with room
+            G[k, n] = max(G[k, n], 0.1 - G[k] @ np.concatenate([y0, [0, 1, 0]]))
+    bound = np.where((rng.random(m) < 0.5) & (np.sum(G[:m, :n].T * D[:, :m], 0) < 0), rng.uniform(1.05, 2, m), 1.0)
+    return Case(
+        F, D, G, off, bound, rng.uniform(0.3, 0.9, c), np.array(rng.uniform(0.5, 4)), y0, np.array(rng.uniform(3, 8))
+    )
+
+
+# Nodes of the first look at a polynomial on [0, 1], and the half width of the interval that each stands for.
+_HALF = 1 / 16
+_NODES = _HALF * (2 * np.arange(8) + 1)
+_VALUES = _NODES[:, None] ** np.arange(DEGREE + 1)
+_SLOPES = np.arange(DEGREE + 1) * _NODES[:, None] ** np.maximum(np.arange(DEGREE + 1) - 1, 0)
+_BEND = np.arange(DEGREE + 1) * (np.arange(DEGREE + 1) - 1.0)
+
+
+def _root(c: np.ndarray, begin: float) -> float:
+    """The first root on [begin, 1] of Σ c_j u^j, which is positive before; infinite if there is none.
+
+    An interval is left behind only if midpoint value, slope and curvature bound exclude that p <= EPS on it.
+    """
+    bend = _BEND[: len(c)] @ abs(c)
+    power = c[::-1]
+    slope = np.polyder(power)
+    stack = [(begin, 1.0)]
+    while stack:
+        a, b = stack.pop()
+        middle, half = 0.5 * (a + b), 0.5 * (b - a)
+        value, rate = np.polyval(power, middle) - EPS, np.polyval(slope, middle)
+        if value - abs(rate) * half - 0.5 * bend * half**2 > 0:
+            continue
+        if abs(rate) <= bend * half:
+            if half < 1e-9:
+                raise Sensitive("tangency")
+            stack += [(middle, b), (a, middle)]
+        elif rate > 0:  # rises all along: so it was below EPS before
+            if np.polyval(power, a) < EPS:
+                raise Sensitive("tangency")
+        elif np.polyval(power, b) <= EPS:  # falls all along: Newton's method from where the root certainly is ahead
+            u = a
+            for _ in range(60):
+                step = np.polyval(power, u) / np.polyval(slope, u)
+                u = min(max(u - step, a), b + half)
+                if abs(step) < 1e-16:
+                    break
+            # The root is simple enough for the next one not to matter: p > EPS / 2 until here, and p < 0 soon after.
+            if np.polyval(slope, u) ** 2 < 4 * bend * EPS or abs(np.polyval(power, u)) > 1e-13 * (1 + sum(abs(c))):
+                raise Sensitive("tangency")
+            return u
+    return np.inf
+
+
+class _Field(NamedTuple):
+    """One mode: z' = M z, the guards that watch it, and what is needed to look for their roots."""
+
+    M: np.ndarray
+    L: np.ndarray  # multipliers: rows of the sliding switches, zero for the others
+    guards: tuple[tuple[int, int], ...]  # (switch, sign of the bound of λ or 0 for its surface)
+    rows: np.ndarray
+    h: float
+    step: np.ndarray  # exp(M h)
+    taylor: np.ndarray  # (guards, DEGREE + 1, n + 3): coefficients per component of z
+
+
+class _Exact:
+    """One case, and its modes as they are met."""
+
+    def __init__(self, case: Case, shape: Shape):
+        self.case, self.shape = case, shape
+        self.size = shape.n + 3
+        self.kinds = ["sgn"] * shape.sgn + ["relay"] * shape.relay + ["impact"] * shape.impact
+        self.base = np.zeros((self.size, self.size))
+        self.base[: shape.n] = case.F
+        self.base[-2, -1], self.base[-1, -2] = -case.omega, case.omega
+        self.D = np.zeros((self.size, shape.switches))
+        self.D[: shape.n] = case.D
+        self.fields: dict[tuple, _Field] = {}
+        self.laws: dict[tuple, tuple] = {}
+
+    def law(self, mode: tuple) -> tuple[np.ndarray, np.ndarray]:
+        """M and the rows of the multipliers, from n_i . (F z + Σ s d + Σ λ d) = 0 for those that slide."""
+        if mode in self.laws:
+            return self.laws[mode]
+        M, L = self.base.copy(), np.zeros((len(mode), self.size))
+        values = [0 if kind == "impact" else s for kind, s in zip(self.kinds, mode)]
+        M[:, self.shape.n] += self.D @ np.array(values, float)
+        slides = [k for k, kind in enumerate(self.kinds) if kind == "sgn" and mode[k] == 0]
+        if slides:
+            matrix = self.case.G[slides] @ self.D[:, slides]
+            if np.linalg.cond(matrix) > 1e4:
+                raise Sensitive("singular")
+            L[slides] = np.linalg.solve(matrix, -self.case.G[slides] @ M)
+            M = M + self.D @ L
+        self.laws[mode] = M, L
+        return M, L
+
+    def field(self, mode: tuple) -> _Field:
+        if mode in self.fields:
+            return self.fields[mode]
+        M, L = self.law(mode)
+        guards, rows = [], []
+        for k, kind in enumerate(self.kinds):
+            if kind == "sgn" and mode[k] == 0:
+                for sign in (1, -1):
+                    row = -sign * L[k]
+                    row[self.shape.n] += self.case.bound[k]
+                    guards.append((k, sign))
+                    rows.append(row)
+                continue
+            guards.append((k, 0))
+            if kind == "sgn":
+                rows.append(mode[k] * self.case.G[k])
+            elif kind == "relay":
+                rows.append(-self.case.off[k - self.shape.sgn] if mode[k] else -self.case.G[k])
+            else:
+                rows.append(self.case.G[k])
+        rows = np.stack(rows)
+        h = 1.5 / np.linalg.norm(M, 2)
+        taylor = [rows]
+        for j in range(1, DEGREE + 1):
+            taylor.append(taylor[-1] @ M * (h / j))
+        self.fields[mode] = _Field(M, L, tuple(guards), rows, h, expm(M * h), np.stack(taylor, 1))
+        return self.fields[mode]
+
+    def settle(self, z: np.ndarray, mode: tuple, at: set[int], leaves: dict[int, int]) -> tuple:
+        """The assignment of stick and slip to the switches at their surfaces that satisfies all laws, by trying all."""
+        valid = []
+        at = sorted(at)
+        options = []
+        for k in at:
+            attracts = self.case.G[k] @ self.D[:, k] < 0
+            options.append((leaves[k],) if k in leaves else (0, 1, -1) if attracts else (1, -1))
+        for choice in itertools.product(*options):
+            trial = list(mode)
+            for k, s in zip(at, choice):
+                trial[k] = s
+            M, L = self.law(tuple(trial))
+            slack = []
+            for k, s in zip(at, choice):
+                if s == 0:
+                    slack.append(1 - abs(L[k] @ z) / self.case.bound[k])
+                elif k not in leaves or self.case.bound[k] > 1:  # else dh/dt = 0 at this instant
+                    slack.append(s * (self.case.G[k] @ M @ z))
+            least = min(slack, default=1.0)
+            if abs(least) < 1e-5:
+                raise Sensitive("at the edge of sliding")
+            if least > 0:
+                valid.append(tuple(trial))
+        if not valid:
+            raise Unsolvable
+        # With b > 1 stick and slip may both be possible; then it sticks.
+        stuck = [sum(v[k] == 0 for k in at) for v in valid]
+        best = [v for v, s in zip(valid, stuck) if s == max(stuck)]
+        if len(best) > 1:
+            raise Sensitive("not unique")
+        return best[0]
+
+    def next_root(self, field: _Field, z: np.ndarray, limit: float, known: dict) -> tuple[float, tuple[int, int]]:
+        """The first event of an arc no longer than `limit`: after how long, and of which guard."""
+        gone = 0.0
+        while gone < limit:
+            c = field.taylor @ z
+            if gone == 0:
+                for i, guard in enumerate(field.guards):
+                    if guard in known:
+                        c[i] = np.concatenate([c[i, known[guard] :], np.zeros(known[guard])])
+            bend = abs(c) @ _BEND
+            low = c @ _VALUES.T - abs(c @ _SLOPES.T) * _HALF - 0.5 * bend[:, None] * _HALF**2
+            roots = np.full(len(c), np.inf)
+            for i in np.flatnonzero(low.min(1) <= EPS):
+                begin = 2 * _HALF * np.argmax(low[i] <= EPS)
+                if gone + begin * field.h < limit:
+                    try:
+                        roots[i] = gone + field.h * _root(c[i], begin)
+                    except Sensitive as problem:
+                        raise Sensitive(*problem.args, gone + begin * field.h) from None
+            first = np.sort(roots)
+            if first[0] < np.inf:
+                if len(first) > 1 and first[1] - first[0] < CROWDED:
+                    raise Sensitive("simultaneous", first[0])
+                return first[0], field.guards[int(np.argmin(roots))]
+            z = field.step @ z
+            gone += field.h
+        return np.inf, (-1, 0)
+
+    def start(self) -> tuple[np.ndarray, tuple]:
+        z = np.concatenate([self.case.y0, [1, 1, 0]])
+        h = self.case.G @ z
+        mode = [0] * len(h)
+        for k, kind in enumerate(self.kinds):
+            if kind == "sgn":
+                mode[k] = int(np.sign(h[k]))
+            elif kind == "relay":
+                mode[k] = int(h[k] > 0)
+        return z, tuple(mode)
+
+    def jump(self, z: np.ndarray, mode: list, k: int, at: set[int]) -> tuple[np.ndarray, list[int]]:
+        """Newton's law at impact k, h'(t+) = -e h'(t-), as a matrix, and the relays that it switches; `mode` and `at`
+        are brought up to date."""
+        rate = self.case.G[k] @ self.base  # h' = rate . z: nothing but velocities
+        push = self.D[:, k]
+        R = np.eye(self.size) - (1 + self.case.e[k - self.shape.sgn - self.shape.relay]) * np.outer(push, rate) / (
+            rate @ push
+        )
+        after = R @ z
+        toggled = []
+        for j, kind in enumerate(self.kinds):
+            if kind == "sgn" and self.case.G[j] @ push != 0:
+                h = self.case.G[j] @ after
+                if abs(h) < 1e-6:
+                    raise Sensitive("simultaneous")
+                mode[j] = int(np.sign(h))
+                at.discard(j)
+            elif kind == "relay" and self.case.G[j] @ push != 0:
+                h = (self.case.off[j - self.shape.sgn] if mode[j] else self.case.G[j]) @ after
+                if abs(h) < 1e-6:
+                    raise Sensitive("simultaneous")
+                if h > 0:
+                    mode[j] = 1 - mode[j]
+                    toggled.append(j)
+        return R, toggled
+
+    def run(self, t1: float, max_events: int, cut: str) -> Trajectory:
+        z, mode = self.start()
+        n = self.shape.n
+        t, last_hit, known = 0.0, {}, {}
+        times, switches, modes, gains = [], [], [], []
+        # From the start, and from every event, until now: how errors made there have grown.
+        growth = np.eye(self.size)[None]
+        if np.min(abs(self.case.G @ z)) < 1e-6:
+            raise Sensitive("start", 0.0)
+        ends = ""
+        while True:
+            field = self.field(mode)
+            try:
+                length, (k, sign) = self.next_root(field, z, t1 + CROWDED - t, known)
+            except Sensitive as problem:
+                raise Sensitive(problem.args[0], t + (problem.args[1] if len(problem.args) > 1 else 0)) from None
+            if t + length >= t1:
+                if t + length < t1 + CROWDED:
+                    raise Sensitive("at the end", t + length)
+                flow = expm(field.M * (t1 - t))
+                z, growth, t = flow @ z, flow @ growth, t1
+                if np.max(np.linalg.norm(growth[:, :n, :n], axis=(1, 2))) > GAIN:
+                    raise Sensitive("chaos", t)
+                break
+            flow = expm(field.M * length)
+            z, growth, t = flow @ z, flow @ growth, t + length
+            row, before = field.rows[field.guards.index((k, sign))], field.M @ z
+            at = {j for j, kind in enumerate(self.kinds) if kind == "sgn" and mode[j] == 0}
+            leaves, R, toggled, new = {}, np.eye(self.size), [], list(mode)
+            gains.append(np.sum(np.linalg.norm(row @ growth, axis=-1)) / abs(row @ before))
+            try:
+                if length < CROWDED and times:
+                    raise Sensitive("crowded")
+                if len(times) >= max_events:
+                    raise Sensitive("many events")
+                if sign:
+                    leaves[k] = sign
+                elif self.kinds[k] == "sgn":
+                    at.add(k)
+                elif self.kinds[k] == "relay":
+                    new[k] = 1 - mode[k]
+                else:
+                    if t - last_hit.get(k, -1) < FLIGHT:
+                        raise Sensitive("accumulation")
+                    last_hit[k] = t
+                    R, toggled = self.jump(z, new, k, at)
+                after = self.settle(R @ z, tuple(new), at, leaves)
+            except Sensitive as problem:
+                raise Sensitive(problem.args[0], t) from None
+            except Unsolvable:
+                times, switches, modes = [*times, t], [*switches, k], [*modes, mode]
+                ends = "no mode"
+                break
+            known = {(j, 0): 1 for j in at if after[j] != 0} | ({(k, 0): 1} if self.kinds[k] == "impact" else {})
+            if sign and self.case.bound[k] == 1:
+                known[k, 0] = 2
+            S = R + np.outer(self.law(after)[0] @ R @ z - R @ before, row) / (row @ before)
+            z, mode = R @ z, after
+            growth = np.concatenate([S @ growth, np.eye(self.size)[None]])
+            if np.max(np.linalg.norm(growth[:, :n, :n], axis=(1, 2))) > GAIN:
+                raise Sensitive("chaos", t)
+            for j in (k, *toggled):
+                times, switches, modes = [*times, t], [*switches, j], [*modes, mode]
+            gains += [gains[-1]] * len(toggled)
+        return Trajectory(
+            t,
+            np.array(times),
+            np.array(switches, int),
+            np.array(modes, int).reshape(len(times), len(mode)),
+            z[:n],
+            np.array(mode),
+            growth[0, :n, :n],
+            float(np.sum(np.linalg.norm(growth[:, :n, :n], axis=(1, 2)))),
+            np.array(gains),
+            ends,
+            cut,
+        )
+
+
+def solve(case: Case, shape: Shape, max_events: int = 40) -> Trajectory | None:
+    """The exact solution; up to a time before it gets sensitive, or nothing if that is at once."""
+    exact, t1, cut = _Exact(case, shape), float(case.t1), ""
+    for _ in range(8):
+        try:
+            return exact.run(t1, max_events, cut)
+        except Sensitive as problem:
+            cut = problem.args[0]
+            t1 = problem.args[1] - 10**-1.5
+            if t1 < 0.1:
+                return None
+    return None
