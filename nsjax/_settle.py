@@ -1,14 +1,20 @@
 """The choice of mode where switches are at their surfaces."""
 
+import itertools
 from typing import Any
 
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from ._filippov import Model, State
 from ._system import frozen
 from ._types import Scalar, Y
+
+
+_TRIED = 3  # so many switches at their surfaces are settled by trying every assignment
 
 
 def settle(
@@ -21,9 +27,10 @@ def settle(
 ) -> tuple[State, Bool[Array, ""], Bool[Array, ""]]:
     """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}, every contact one from {1, 0}.
 
-    All of them hold if that is valid (|λ| <= b, a contact force λ >= 0). Otherwise the one that violates its law most
-    is released, to the sign of its λ, and a released switch whose motion then opposes this is taken back, until nothing
-    is violated.
+    All of them hold if that is valid (|λ| <= b, a contact force λ >= 0), else as many as can be. Of up to three
+    switches every assignment is tried; if two are equally good the solution is not unique. Of more, the one that
+    violates its law most is released, to the sign of its λ, and a released switch whose motion then opposes this is
+    taken back, until nothing is violated.
 
     **Arguments:**
 
@@ -33,7 +40,7 @@ def settle(
     - `leaves`: for each switch the sign with which its λ just reached its bound, else 0.
 
     **Returns:** the new state, whether the solution is not unique (a repulsive surface (2.25) met without a side), and
-    whether no valid assignment was found.
+    whether not exactly one assignment was found.
     """
     model, t, y = frozen((model, t, y))  # modes have no derivative
     which = tuple(at)
@@ -60,7 +67,7 @@ def settle(
             trial[k] = jnp.where(at[k], jnp.where(leaves[k] != 0, 0, 1), mode[k])
         elif k in model.holdable:
             trial[k] = jnp.where(at[k], 0, mode[k])
-    _, rates, slopes = look(trial)
+    s, rates, slopes = look(trial)
     repels = {k: slopes[k] >= 0 for k in which}
     for k in which:
         if k in model.contacts:
@@ -76,9 +83,20 @@ def settle(
             # It cannot but cross; at a double root the sign of dh/dt is rounding.
             side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
             trial[k] = jnp.where(at[k], side, mode[k])
-    if len(which) == 1:
+    if 1 < len(which) <= _TRIED:
+        trial, wrong = _best(model, which, at, came, leaves, trial, look)
+    elif len(which) == 1:
         trial, wrong = _amend(model, which, at, leaves, trial, look(trial))[0], false
     else:
+        # A bound that is reached together with that of another switch is left with it, not in a second event.
+        leaves = dict(leaves)
+        for k in which:
+            if k in model.holdable and k not in model.contacts:
+                over = s[k] * came[k].astype(t.dtype) / model.bound(k) - 1
+                tied = at[k] & (came[k] != 0) & ~repels[k] & (leaves[k] == 0) & (jnp.abs(over) <= _nearly(t))
+                leaves[k] = jnp.where(tied, came[k], leaves[k])
+                trial[k] = jnp.where(tied, came[k], trial[k])
+
         # One release or taking back a round, until nothing is violated; so many rounds do for all to change twice.
         def amend(carry: tuple) -> tuple:
             count, trial, _ = carry
@@ -109,6 +127,61 @@ def settle(
         roots[k] = jnp.where(at[k], fresh, roots[k]).astype(jnp.int32)
     state = state._replace(mode=tuple(m.astype(jnp.int32) for m in trial.values()), roots=tuple(roots))
     return state, unsure, wrong
+
+
+def _nearly(like: Scalar) -> float:
+    """How closely two bounds must be reached to count as reached together."""
+    return max(1e-10, 64 * float(jnp.finfo(like.dtype).eps))
+
+
+def _best(
+    model: Model, which: tuple, at: dict, came: dict, leaves: dict, trial: dict, look: Any
+) -> tuple[dict, Bool[Array, ""]]:
+    """The valid assignment that holds most, of all, and whether it is not the only one."""
+    options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
+    table = np.array(list(itertools.product(*options)), np.int32)
+
+    def judge(row: Int[Array, " m"]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+        mode = dict(trial)
+        for i, k in enumerate(which):
+            mode[k] = jnp.where(at[k], row[i], trial[k]).astype(jnp.int32)
+        s, rates, slopes = look(mode)
+        valid, held = jnp.ones((), bool), jnp.zeros((), jnp.int32)
+        for i, k in enumerate(which):
+            small = 1e-10 * jnp.abs(slopes[k])
+            if k in model.contacts:
+                stays = row[i] == 1
+                law = jnp.where(
+                    stays, (s[k] * slopes[k] >= 0) & (leaves[k] == 0), (rates[k] > small) | (leaves[k] != 0)
+                )
+            else:
+                stays = (row[i] == 0) & (k in model.holdable)
+                if k in model.holdable:
+                    # Who has just left, at this very instant, is at the bound and may have dh/dt = 0.
+                    opening = rates[k] * row[i].astype(rates[k].dtype)
+                    goes = (opening > small) | ((row[i] == came[k]) & (opening >= -small))
+                    forced = jnp.where(slopes[k] >= 0, -leaves[k], leaves[k])
+                    goes = jnp.where(leaves[k] == 0, goes, row[i] == forced)
+                    bound = model.bound(k)
+                    left = (came[k] != 0) & (s[k] * came[k].astype(s[k].dtype) >= (1 - _nearly(s[k])) * bound)
+                    sticks = (jnp.abs(s[k]) <= bound) & (leaves[k] == 0) & ((slopes[k] < 0) | (came[k] == 0)) & ~left
+                else:
+                    crosses = (leaves[k] != 0) & (came[k] != 0)
+                    unmoved = jnp.where(came[k] == 0, 1, came[k])
+                    onward = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
+                    goes = row[i] == jnp.where(crosses, -came[k], onward)
+                    sticks = jnp.zeros((), bool)
+                law = jnp.where(stays, sticks, goes)
+            # A switch that is not at its surface has no choice: its first option stands for what it is.
+            valid = valid & jnp.where(at[k], law, row[i] == options[i][0])
+            held = held + (at[k] & stays).astype(jnp.int32)
+        return valid, held
+
+    valid, held = jax.vmap(judge)(jnp.asarray(table))
+    score = jnp.where(valid, held, -1)
+    best = jnp.argmax(score)
+    out = {k: jnp.where(at[k], jnp.asarray(table)[best, i], trial[k]).astype(jnp.int32) for i, k in enumerate(which)}
+    return trial | out, jnp.sum(score == score[best]) != 1
 
 
 def _pinned(model: Model, t: Scalar, y: Y, state: State, at: dict, trial: dict, rates: dict) -> dict:

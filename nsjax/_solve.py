@@ -140,6 +140,8 @@ class _Flow(eqx.Module):
         terms = dfx.ODETerm(lambda t, y, args: flow(t, y))
         # The step size is no function to be differentiated; powers of an error of zero are not even differentiable.
         t_still, t_next_still, y_still, y1_still, error = frozen((c.t, t_next, c.y, y1, error))
+        # A step that overflows is too long, but must not make the next one infinity divided by infinity.
+        y1_still = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), y1_still, y_still)
         order = stepper.solver.error_order(terms)
         keep, a, b, _, controller, outcome = self.controller.adapt_step_size(
             t_still, t_next_still, y_still, y1_still, None, error, order, c.controller
