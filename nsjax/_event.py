@@ -83,7 +83,7 @@ def locate(
     f0: Y,
     state: State,
     coefficients: Float[Array, "slots parts coefficients"],
-) -> tuple[Bool[Array, ""], Scalar, Y, list[Y], Int[Array, ""], Int[Array, ""]]:
+) -> tuple[Bool[Array, ""], Scalar, Y, Int[Array, ""], Int[Array, ""]]:
     """The earliest event of a step: its time, the state there, the slot and the part of the guard that fires.
 
     The root on the dense output is only where to look: the step is taken again to it, and one Newton step with the true
@@ -104,7 +104,7 @@ def locate(
     def guards(t: Scalar, y: Y) -> Array:
         return model.stacked(frozen_model.guards(t, y, state), -1.0)
 
-    y_guess, _, increments, _ = stepper(flow, start, guess, y_start, f_start)
+    y_guess, *_ = stepper(flow, start, guess, y_start, f_start)
     f = flow(guess, y_guess)
     one = jnp.ones_like(guess)
     values, rates = jax.jvp(guards, (guess, y_guess), (one, f))
@@ -124,7 +124,7 @@ def locate(
     # At the very start of the step the event is a consequence of the one before: it has the same time and derivative.
     at_once = jnp.isfinite(root[slot]) & (root[slot] <= 0)
     te, y_end = jax.tree.map(lambda a, b: jnp.where(at_once, a, b), (t, y), (te, y_end))
-    return jnp.any(found), te, y_end, increments, slot, part[slot]
+    return jnp.any(found), te, y_end, slot, part[slot]
 
 
 def _derivative(model: Model, fn: Any, t: Scalar, y: Y, state: State) -> Scalar:
@@ -206,7 +206,7 @@ def land(
     coefficients: Float[Array, "slots parts coefficients"],
 ) -> Landing:
     """Locates the earliest event of a step and makes the transition there."""
-    found, te, before, increments, slot, part = locate(model, stepper, t, t_next, y, f0, state, coefficients)
+    found, te, before, slot, part = locate(model, stepper, t, t_next, y, f0, state, coefficients)
     halted = te <= t
     fired = {k: jnp.zeros((), bool) for k in range(len(model.switches))}
     bounds = {k: jnp.zeros((), jnp.int32) for k in range(len(model.switches))}
@@ -299,7 +299,11 @@ def land(
             news = news | fired[k]
     cosine, bend = transversality(model, te, before, state, slot, part)
     grazes = found & news & ~halted & (cosine < jnp.cbrt(jnp.finfo(te.dtype).eps)) & (bend > 0)
-    points = stack(stepper.points(y, before, increments)) if want_points else None
+    points = None
+    if want_points:
+        # Once more, to the very event and with the derivatives of where it begins and ends.
+        _, increments = _step_to(te, stepper, (model, t, y, f0, state))
+        points = stack(stepper.points(y, before, increments))
     f_after = model.flow(t_after, after, state_after)
     return Landing(found, te, t_after, before, after, f_after, state_after, slot, news, points, cosine, grazes, result)
 

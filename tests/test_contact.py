@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 from jaxtyping import Array
 from models import flat, Motion, pid
 
@@ -84,6 +85,41 @@ def test_lift_off():
     np.testing.assert_allclose(flat(sol.y1), [p.r / p.m * free**3 / 6, p.r / p.m * free**2 / 2], rtol=1e-11)
     derivative = jax.jacfwd(lambda g: jnp.stack(solve(Rising(g=g), 0.0, t1, Motion(0.0, 0.0), **TIGHT).y1))(p.g)
     np.testing.assert_allclose(derivative, [-(free**2) / 2, -free], rtol=1e-9)
+
+
+class TableBall(nsjax.System):
+    """`reference.ball_on_table`: lands, bounces, rests, lifts off and lands again."""
+
+    a: float = 1.2
+    w: float = 1.0
+    g: float = 1.0
+    e: float = 0.4
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -self.g + s.table)
+
+    @nsjax.impact
+    def table(self, t, y):
+        return y.x - self.a * jnp.cos(self.w * t)
+
+    @table.restitution
+    def table(self):
+        return self.e
+
+
+def test_ball_on_an_oscillating_table():
+    """Pitfalls 14, 16: against 40 digits, the times of landing, rest, lift-off and the next landing."""
+    ref = reference.ball_on_table()
+    sol = solve(TableBall(), 0.0, 9.0, Motion(1.7, 0.0), saveat=dfx.SaveAt(steps=True), **TIGHT)
+    events = list(sol.events)
+    rest = [i for i, e in enumerate(events) if e.mode_after["table"] == 1][0]
+    times = [float(events[i].t) for i in (0, rest, rest + 1, rest + 2)]
+    want = [ref.first_impact, ref.accumulation, ref.lift_off, ref.next_impact]
+    np.testing.assert_allclose(times, [float(t) for t in want], atol=1e-9)
+    np.testing.assert_allclose(events[rest + 2].y_before.v, float(ref.next_velocity), atol=1e-9)
+    resting = np.asarray(sol.modes[:, 0]) == 1
+    gap = np.asarray(sol.ys.x)[resting] - 1.2 * np.cos(np.asarray(sol.ts)[resting])
+    assert resting.sum() > 3 and np.max(np.abs(gap)) < 1e-14
 
 
 class Thrown(NamedTuple):

@@ -247,3 +247,19 @@ def test_two_surfaces():
     np.testing.assert_allclose(found[1], value, atol=1e-10)
     print(np.abs(found[0] - want).max())
     np.testing.assert_allclose(found[0], want, atol=1e-9 * np.abs(want).max())
+
+
+def test_saved_states_within_a_step_to_an_event():
+    """Pitfall 19: the derivative of a state saved on such a step is that of a solution which ends there."""
+    ts = jnp.array([1.0, 3.6, 12.0, 13.2])  # in slip; on the one long step of stick, up to its end at 13.27
+
+    def saved(p, t1, saveat):
+        system = gallery.StickSlip(v_dr=p[2])
+        sol = solve(system, 0.0, t1, Motion(p[0], p[1]), saveat=saveat, stepsize_controller=pid(1e-9))
+        return jnp.stack(sol.ys)
+
+    p = jnp.array([2.0, 0.0, 0.2])
+    within = jax.jit(jax.jacfwd(lambda p: saved(p, 14.0, dfx.SaveAt(ts=ts))))(p)
+    ends = jax.jit(jax.jacfwd(lambda p, t1: saved(p, t1, dfx.SaveAt(t1=True))))
+    for i, t in enumerate(ts):
+        np.testing.assert_allclose(within[:, i], ends(p, t)[:, 0], atol=1e-8)
