@@ -161,7 +161,9 @@ def _best(
                     opening = rates[k] * row[i].astype(rates[k].dtype)
                     goes = (opening > small) | ((row[i] == came[k]) & (opening >= -small))
                     forced = jnp.where(slopes[k] >= 0, -leaves[k], leaves[k])
-                    goes = jnp.where(leaves[k] == 0, goes, row[i] == forced)
+                    # With b = 1 dh/dt is zero too where λ reaches it, as far as it does.
+                    forced = (row[i] == forced) & (opening >= -1e-6 * jnp.abs(slopes[k]))
+                    goes = jnp.where(leaves[k] == 0, goes, forced)
                     bound = model.bound(k)
                     left = (came[k] != 0) & (s[k] * came[k].astype(s[k].dtype) >= (1 - _nearly(s[k])) * bound)
                     sticks = (jnp.abs(s[k]) <= bound) & (leaves[k] == 0) & ((slopes[k] < 0) | (came[k] == 0)) & ~left
