@@ -84,7 +84,7 @@ def settle(
             side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
             trial[k] = jnp.where(at[k], side, mode[k])
     if 1 < len(which) <= _TRIED:
-        trial, wrong = _best(model, which, at, came, leaves, trial, look)
+        trial, wrong = _best(model, t, which, at, came, leaves, trial, look)
     elif len(which) == 1:
         trial, wrong = _amend(model, which, at, leaves, trial, look(trial))[0], false
     else:
@@ -135,7 +135,7 @@ def _nearly(like: Scalar) -> float:
 
 
 def _best(
-    model: Model, which: tuple, at: dict, came: dict, leaves: dict, trial: dict, look: Any
+    model: Model, t: Scalar, which: tuple, at: dict, came: dict, leaves: dict, trial: dict, look: Any
 ) -> tuple[dict, Bool[Array, ""]]:
     """The valid assignment that holds most, of all, and whether it is not the only one."""
     options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
@@ -148,7 +148,7 @@ def _best(
         s, rates, slopes = look(mode)
         valid, held = jnp.ones((), bool), jnp.zeros((), jnp.int32)
         for i, k in enumerate(which):
-            small = 1e-10 * jnp.abs(slopes[k])
+            small = _nearly(t) * jnp.abs(slopes[k])
             if k in model.contacts:
                 stays = row[i] == 1
                 law = jnp.where(
@@ -165,8 +165,9 @@ def _best(
                     forced = (row[i] == forced) & (opening >= -1e-6 * jnp.abs(slopes[k]))
                     goes = jnp.where(leaves[k] == 0, goes, forced)
                     bound = model.bound(k)
-                    left = (came[k] != 0) & (s[k] * came[k].astype(s[k].dtype) >= (1 - _nearly(s[k])) * bound)
-                    sticks = (jnp.abs(s[k]) <= bound) & (leaves[k] == 0) & ((slopes[k] < 0) | (came[k] == 0)) & ~left
+                    left = (came[k] != 0) & (s[k] * came[k].astype(t.dtype) >= (1 - _nearly(t)) * bound)
+                    attracts = (slopes[k] < 0) | (came[k] == 0)
+                    sticks = (jnp.abs(s[k]) <= (1 + _nearly(t)) * bound) & (leaves[k] == 0) & attracts & ~left
                 else:
                     crosses = (leaves[k] != 0) & (came[k] != 0)
                     unmoved = jnp.where(came[k] == 0, 1, came[k])
