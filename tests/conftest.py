@@ -3,10 +3,6 @@
 import os
 import pathlib
 
-
-# Compiling is what takes long here, not running: two to three times less of it. (Read when JAX is first imported.)
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
-
 import jax
 import matplotlib
 

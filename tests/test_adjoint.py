@@ -48,6 +48,7 @@ def test_lanes(forward, adjoint):
     assert np.isfinite(gradient).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ADJOINTS)
 def test_impacts_and_saved_states(adjoint):
     """Restitution, states between steps, and the end time."""
@@ -65,6 +66,7 @@ def test_impacts_and_saved_states(adjoint):
     np.testing.assert_allclose(got, want, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_hessian():
     """Forward over reverse, against forward over forward."""
 

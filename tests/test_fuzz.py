@@ -77,7 +77,12 @@ def _switches(shape: Shape) -> tuple[Any, ...]:
     return tuple(out)
 
 
-@functools.partial(jax.jit, static_argnames=("shape", "solver", "derive"))
+# Compiling is what takes long, not running.
+@functools.partial(
+    jax.jit,
+    static_argnames=("shape", "solver", "derive"),
+    compiler_options={"xla_backend_optimization_level": 0},
+)
 def run(cases: Case, shape: Shape, solver: dfx.AbstractSolver, derive: bool) -> tuple:
     def one(case: Case):
         def flow(y0):
