@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from diffrax._root_finder import use_stepsize_tol
 from jax.core import Tracer
 
+from ._filippov import Model, State
 from ._structure import is_affine, is_constant
 from ._system import impact, relay, sgn, System
 from ._types import Scalar, Y
@@ -244,3 +245,23 @@ def _check_impact(
             f"`s.{name}` in `vector_field`, but it does not occur there. Add it to the equation of motion "
             f"(`+ s.{name} / m`), or write the jump out with `@{name}.reset`."
         )
+
+
+def check_contacts(model: Model, t: Scalar, y: Y) -> Scalar:
+    """Checks that every contact force opens its gap, which depends on numbers.
+
+    **Returns:** the time `t`, to be used so that the error is raised.
+    """
+    zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
+    free = State((), (None,) * len(zeros), ())
+    for k in model.contacts:
+        unit = tuple(jnp.where(i == k, 1, zero) for i, zero in enumerate(zeros))
+        force = model.rates((k,), t, y, free, unit)[0] - model.rates((k,), t, y, free, zeros)[0]
+        name = model.switches[k].name
+        t = eqx.error_if(
+            t,
+            force < 0,
+            f"`{type(model.system).__name__}.vector_field` must contain `s.{name}` with the sign with which a contact "
+            f"force s.{name} >= 0 opens the gap `{name}`, but it closes it. Change its sign.",
+        )
+    return t

@@ -127,11 +127,6 @@ def locate(
     return jnp.any(found), te, y_end, slot, part[slot]
 
 
-def _derivative(model: Model, fn: Any, t: Scalar, y: Y, state: State) -> Scalar:
-    """d/dt of `fn(t, y)` along the flow."""
-    return jax.jvp(fn, (t, y), (jnp.ones_like(t), model.flow(t, y, state)))[1]
-
-
 def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> Y:
     """The state after an impact: the user's reset, or Newton's law with the impulse along ∂f/∂s.
 

@@ -1,12 +1,8 @@
-"""The flow: one flat loop whose body is one step of a diffrax solver.
-
-Under `vmap` every lane is in its own mode and at its own time: it takes a step, or works on its event, and never waits
-for the segments of the others.
-"""
+"""`solve`: the flow from one time to another, as one flat loop."""
 
 import functools as ft
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -14,324 +10,45 @@ import equinox.internal as eqxi
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Int
 
-from ._check import check_model, check_solve
-from ._compact import compact_cond
-from ._crossing import deflate, elevate, nodes, to_bernstein, to_chebyshev
-from ._event import land, Landing
+from ._check import check_contacts, check_model, check_solve
 from ._filippov import Model, State
+from ._flow import Carry, finite, Flow
 from ._forward import forward_only
 from ._jacobian import dense_jacobian
-from ._once import once
 from ._save import Log, Saved
 from ._solution import Events, is_okay, RESULTS, Solution
 from ._start import start_mode
-from ._step import stack, Stepper
+from ._step import Stepper
 from ._structure import is_affine
-from ._system import arrays_of, frozen, System
+from ._system import arrays_of, System
 from ._types import Scalar, Y
 
 
-class _Carry(eqx.Module):
-    """What one turn of the loop hands to the next."""
+class _Options(NamedTuple):
+    """The arguments of `solve` that say how, and not what."""
 
-    t: Scalar
-    y: Y
-    f: Y  # the field at (t, y)
-    state: State
-    dt: Scalar
-    controller: PyTree
-    active: Bool[Array, ""]
-    result: RESULTS
-    steps: Int[Array, ""]
-    accepted: Int[Array, ""]
-    events: Int[Array, ""]
-    halted: Int[Array, ""]  # events in a row without progress in time
-    halvings: Int[Array, ""]  # in a row, to resolve a guard
-    grazed: Bool[Array, ""]  # whether an event was tangential
-    log: Log | None
-    saved: Saved
-    meter: PyTree
-
-
-class _Flow(eqx.Module):
-    """One solve: the model, the method, and the body of its loop."""
-
-    model: Model
-    stepper: Stepper
+    given: dict[str, Any]
+    solver: dfx.AbstractSolver
     controller: dfx.AbstractStepSizeController
-    t0: Scalar
-    t1: Scalar
-    max_steps: int = eqx.field(static=True)
-    max_events: int = eqx.field(static=True)
-    keep_steps: int = eqx.field(static=True)
-    want_points: bool = eqx.field(static=True)
+    saveat: dfx.SaveAt
+    dt0: Scalar | None
+    max_steps: int
+    max_events: int
+    adjoint: dfx.AbstractAdjoint
+    throw: bool
     meter: dfx.AbstractProgressMeter
-    affine: tuple[bool, ...] = eqx.field(static=True)  # whether each guard is affine in (t, y)
-    degree: int = eqx.field(static=True)  # of the polynomial for one that is not
-    reverse: bool = eqx.field(static=True)  # whether the loop is to be transposed
-
-    def coefficients(
-        self, t: Scalar, t_next: Scalar, y: Y, y1: Y, ks: list[Y], state: State
-    ) -> tuple[list[list[list[Scalar]]], Bool[Array, ""]]:
-        """Bernstein coefficients `[slot][part][j]` of the guards along a step, and whether they represent them well.
-
-        A guard affine in (t, y) has its values at the control points as coefficients; any other is interpolated, and
-        the size of its last Chebyshev coefficients tells whether a polynomial of that degree can stand for it.
-        """
-        out: list[list[list[Scalar]]] = [[] for _ in self.model.slots]
-        resolved = jnp.ones((), bool)
-        dt = t_next - t
-        if any(self.affine):
-            n = self.stepper.degree
-            rows = [
-                self.model.guards(t + dt * (j / n), point, state)
-                for j, point in enumerate(self.stepper.points(y, y1, ks))
-            ]
-            for i, affine in enumerate(self.affine):
-                if affine:
-                    out[i] = [list(c) for c in zip(*[row[i] for row in rows])]
-        if not all(self.affine):
-            n = self.degree
-            at = [float(u) for u in nodes(n)]
-            samples = self.stepper.samples(y, y1, ks, n)
-            rows = [self.model.guards(t + dt * u, point, state) for u, point in zip(at, samples)]
-            for i, affine in enumerate(self.affine):
-                if affine:
-                    continue
-                for values in zip(*[row[i] for row in rows]):
-                    v = jnp.stack(values)
-                    tail = jnp.max(jnp.abs(jnp.asarray(to_chebyshev(n)[-2:], t.dtype) @ v))
-                    resolved = resolved & ~(tail > max(1e-7, 64 * float(jnp.finfo(t.dtype).eps)) * jnp.max(jnp.abs(v)))
-                    out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ v))
-        return out, resolved
-
-    def stacked(self, coefficients: list[list[list[Scalar]]]) -> Float[Array, "slots parts coefficients"]:
-        """The same as one array, of one degree, known roots at the start of the step divided out of it."""
-        n = self.stepper.degree if all(self.affine) else self.degree
-        dtype = self.t0.dtype
-        rows = [
-            [
-                jnp.stack(c) if len(c) == n + 1 else jnp.asarray(elevate(len(c) - 1, n), dtype) @ jnp.stack(c)
-                for c in row
-            ]
-            for row in coefficients
-        ]
-        return self.model.stacked(rows, -1.0)
-
-    def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list) -> Landing:
-        """The step once more, to its first event."""
-        coefficients = lax.stop_gradient(coefficients)
-        known = self.model.stacked(self.model.known_roots(state), 0)
-        polynomials = deflate(self.stacked(coefficients), known)
-        return land(self.model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials)
-
-    def body(self, c: _Carry) -> _Carry:
-        model, stepper = self.model, self.stepper
-
-        def flow(t: Scalar, y: Y) -> Y:
-            return model.flow(t, y, c.state)
-
-        t_next = jnp.where(c.t + c.dt >= self.t1, self.t1, c.t + c.dt)
-        y1, error, ks, _ = stepper(flow, c.t, t_next, c.y, c.f)
-        # An error that is not a number is too large.
-        error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
-        terms = dfx.ODETerm(lambda t, y, args: flow(t, y))
-        # The step size is no function to be differentiated; powers of an error of zero are not even differentiable.
-        t_still, t_next_still, y_still, y1_still, error = frozen((c.t, t_next, c.y, y1, error))
-        # A step that overflows is too long, but must not make the next one infinity divided by infinity.
-        y1_still = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), y1_still, y_still)
-        order = stepper.solver.error_order(terms)
-        keep, a, b, _, controller, outcome = self.controller.adapt_step_size(
-            t_still, t_next_still, y_still, y1_still, None, error, order, c.controller
-        )
-        dt = b - a
-        halvings = c.halvings
-        result = RESULTS.promote(outcome)
-
-        if model.slots:
-            coefficients, resolved = self.coefficients(c.t, t_next, c.y, y1, ks, c.state)
-            finite, quiet = _survey(coefficients, model.known_roots(c.state))
-            result = RESULTS.where(keep & ~finite, RESULTS.nonfinite_field, result)
-            # A guard that is no polynomial to the precision needed is not trusted: a shorter step is. (At most so
-            # often: one with a kink never is.)
-            # Nor is a step so short that rounding of time alone spoils the polynomial.
-            eps = float(jnp.finfo(c.t.dtype).eps)
-            floor = 4 * eps / max(1e-7, 64 * eps) * jnp.maximum(jnp.abs(c.t), self.t1 - self.t0)
-            poor = keep & finite & ~resolved & (halvings < 30) & (t_next - c.t > floor)
-            halvings = jnp.where(poor, halvings + 1, jnp.where(keep, 0, halvings))
-            keep = keep & ~poor
-            dt = jnp.where(poor, 0.5 * (t_next - c.t), dt)
-            # On the last few ulps before the end the polynomials are rounding.
-            busy = c.active & keep & finite & ~quiet & (t_next - c.t > 4 * eps * jnp.abs(c.t))
-        keep = keep & c.active
-
-        y_end = model.project(t_next, y1, c.state)
-        f_end = stepper.last_slope(ks, t_next - c.t, flow, t_next, y_end)
-        t, y, f, state = t_next, y_end, f_end, c.state
-        event = jnp.zeros((), bool)
-        events, halted, grazed, log = c.events, c.halted, c.grazed, c.log
-        t_stop, points, before = t_next, None, y1
-        if self.want_points:
-            points = stack(stepper.points(c.y, y1, ks))
-        if model.slots:
-            here = (c.t, t_next, c.y, c.f, c.state, lax.stop_gradient(coefficients))
-            still = Landing(
-                event,
-                t_next,
-                t_next,
-                y1,
-                y_end,
-                f_end,
-                c.state,
-                jnp.zeros((), jnp.int32),
-                event,
-                points,
-                c.t,
-                event,
-                RESULTS.successful,
-            )
-            there = _landed(busy, self, here, still)
-            event = busy & there.found
-
-            def pick(x: Any, y: Any) -> Any:
-                return jax.tree.map(lambda a, b: jnp.where(event, a, b), x, y)
-
-            t, y, f, state = pick(
-                (there.t_after, there.y_after, there.f_after, there.state), (t_next, y_end, f_end, c.state)
-            )
-            state = pick(state, state._replace(roots=tuple(jnp.zeros_like(r) for r in state.roots)))
-            t_stop, before = pick((there.t, there.y_before), (t_next, y1))
-            if self.want_points:
-                points = pick(there.points, points)
-            log_it = event & there.news
-            assert log is not None
-            at = there.t_after * model.direction
-            row = (at, there.y_before, there.y_after, there.slot, there.state.mode, there.transversality)
-            log = log.write(events, log_it, *row)
-            grazed = grazed | (event & there.grazes)
-            events = events + log_it.astype(jnp.int32)
-            halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(keep, 0, halted))
-            result = RESULTS.where(event, there.result, result)
-            result = RESULTS.where(halted > 8 + 4 * len(model.switches), RESULTS.stuck_in_events, result)
-
-        # What happened to this lane: an event, an accepted step, a rejected one, or nothing as it has ended.
-        moved = keep | event
-
-        def settle(new: Any, old: Any) -> Any:
-            return jax.tree.map(lambda a, b: jnp.where(moved, a, b), new, old)
-
-        saved = c.saved
-        if saved.request.ts is not None:
-            mode = c.state.mode
-            saved = saved.write_times(moved, c.t, t_stop, points, mode, model.system, model.direction, self.reverse)
-        saved = saved.write_step(moved, c.accepted, c.t, t_stop, points)
-        accepted = c.accepted + moved.astype(jnp.int32)
-        if self.keep_steps:
-            due = moved & ((accepted % self.keep_steps == 0) | event)
-            saved = saved.write(due, t_stop, before, c.state.mode, model.system, model.direction)
-            saved = saved.write(due & event, t, y, state.mode, model.system, model.direction)
-        t, y, f, state = settle((t, y, f, state), (c.t, c.y, c.f, c.state))
-
-        steps = c.steps + c.active.astype(jnp.int32)
-        done = t >= self.t1
-        result = RESULTS.where(
-            (steps >= self.max_steps) & ~done & (result == RESULTS.successful), RESULTS.max_steps_reached, result
-        )
-        if model.slots:
-            full = (events >= self.max_events) & ~done & (result == RESULTS.successful)
-            result = RESULTS.where(full, RESULTS.max_events_reached, result)
-        bad = ~_finite((y, f))
-        result = RESULTS.where(bad, RESULTS.nonfinite_field, result)
-        # Rejected again and again, down to nothing: at a place where the field ends, or where it is too rough.
-        tiny = ~moved & ((t + dt <= t) | (dt <= 1e-6 * float(jnp.finfo(t.dtype).eps) * (self.t1 - self.t0)))
-        ended = ~_finite(y1)
-        tiny = tiny & (result == RESULTS.successful)
-        result = RESULTS.where(tiny & ended, RESULTS.nonfinite_field, result)
-        result = RESULTS.where(tiny & ~ended, RESULTS.dt_min_reached, result)
-        result = RESULTS.where(c.active, result, c.result)
-        active = c.active & ~done & (result == RESULTS.successful)
-        meter = self.meter.step(c.meter, jnp.where(active, (t - self.t0) / (self.t1 - self.t0), 1.0))
-
-        def hold(new: Any, old: Any) -> Any:
-            return jax.tree.map(lambda a, b: jnp.where(c.active, a, b), new, old)
-
-        return _Carry(
-            t=t,
-            y=y,
-            f=f,
-            state=state,
-            dt=hold(dt, c.dt),
-            controller=hold(controller, c.controller),
-            active=active,
-            result=result,
-            steps=steps,
-            accepted=accepted,
-            events=events,
-            halted=halted,
-            halvings=halvings,
-            grazed=grazed,
-            log=log,
-            saved=saved,
-            meter=meter,
-        )
-
-
-def _survey(coefficients: list, known: list) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether all coefficients are finite, and whether certainly no guard has a root on the step: one of its parts is
-    positive in all coefficients but those which vanish with its known roots."""
-
-    def least(c: list[Scalar], roots: Int[Array, ""]) -> Scalar:
-        return ft.reduce(jnp.minimum, [jnp.where(j < roots, 1, x) if j < 3 else x for j, x in enumerate(c)])
-
-    rows = [ft.reduce(jnp.maximum, map(least, row, roots)) for row, roots in zip(coefficients, known)]
-    return _finite(coefficients), once(ft.reduce(jnp.minimum, rows)) > 0
-
-
-def _finite(tree: Any) -> Bool[Array, ""]:
-    """Whether all numbers are finite: only then are all of their products with zero."""
-    return once(sum(jnp.sum(0 * x) for x in jax.tree.leaves(tree))) == 0
-
-
-def _landed(pred: Any, flow: _Flow, here: tuple, default: Landing) -> Landing:
-    """`flow.land(*here)` for lanes with work to do, else `default`."""
-    dynamic, static = eqx.partition((flow, here), eqx.is_array)
-    dynamic_default, static_default = eqx.partition(default, eqx.is_array)
-
-    def branch(dynamic: Any) -> Any:
-        flow, here = eqx.combine(dynamic, static)
-        return eqx.filter(flow.land(*here), eqx.is_array)
-
-    if flow.reverse:  # `compact_cond` knows no transposition
-        return eqx.combine(lax.cond(pred, branch, lambda _: dynamic_default, dynamic), static_default)
-    return eqx.combine(compact_cond(pred, branch, (dynamic,), dynamic_default), static_default)
 
 
 @eqx.filter_jit
-def _run(
-    system: System,
-    t0: Scalar,
-    t1: Scalar,
-    y0: Y,
-    given: dict[str, Any],
-    solver: dfx.AbstractSolver,
-    controller: dfx.AbstractStepSizeController,
-    saveat: dfx.SaveAt,
-    dt0: Scalar | None,
-    max_steps: int,
-    max_events: int,
-    adjoint: dfx.AbstractAdjoint,
-    throw: bool,
-    meter: dfx.AbstractProgressMeter,
-) -> Solution:
+def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> Solution:
     def run(system: System, t0: Scalar, t1: Scalar, y0: Y) -> Solution:
-        options = solver, controller, saveat, dt0, max_steps, max_events, adjoint, throw, meter
-        return _integrate(system, t0, t1, y0, given, *options)
+        return _integrate(system, t0, t1, y0, options)
 
-    if isinstance(adjoint, dfx.DirectAdjoint):
+    if isinstance(options.adjoint, dfx.DirectAdjoint):
         return dense_jacobian(run, system, t0, t1, y0)
-    if not isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
+    if not isinstance(options.adjoint, dfx.RecursiveCheckpointAdjoint):
         system, t0, t1, y0 = forward_only(
             (system, t0, t1, y0),
             "`nsjax.solve` was differentiated in reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`), which needs "
@@ -341,39 +58,14 @@ def _run(
     return run(system, t0, t1, y0)
 
 
-def _integrate(
-    system: System,
-    t0: Scalar,
-    t1: Scalar,
-    y0: Y,
-    given: dict[str, Any],
-    solver: dfx.AbstractSolver,
-    controller: dfx.AbstractStepSizeController,
-    saveat: dfx.SaveAt,
-    dt0: Scalar | None,
-    max_steps: int,
-    max_events: int,
-    adjoint: dfx.AbstractAdjoint,
-    throw: bool,
-    meter: dfx.AbstractProgressMeter,
-) -> Solution:
+def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> Solution:
+    given, solver, controller, saveat, dt0, max_steps, max_events, adjoint, throw, meter = options
     reverse = isinstance(adjoint, dfx.RecursiveCheckpointAdjoint)
     direction = jnp.where(t1 >= t0, 1, -1).astype(t0.dtype)
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
     model = Model(system, direction, start, y0)
-    for k in model.contacts:
-        zeros = tuple(jnp.zeros_like(t0) for _ in model.switches)
-        unit = tuple(jnp.where(i == k, 1, zero) for i, zero in enumerate(zeros))
-        blank = State((), (None,) * len(zeros), ())
-        force = model.rates((k,), start, y0, blank, unit)[0] - model.rates((k,), start, y0, blank, zeros)[0]
-        name = model.switches[k].name
-        start = eqx.error_if(
-            start,
-            force < 0,
-            f"`{type(system).__name__}.vector_field` must contain `s.{name}` with the sign with which a contact force "
-            f"s.{name} >= 0 opens the gap `{name}`, but it closes it. Change its sign.",
-        )
+    start = check_contacts(model, start, y0)
     stepper = Stepper(solver)
     max_events = max_events if model.slots else 0
     state, result = start_mode(model, start, y0, given)
@@ -393,7 +85,7 @@ def _integrate(
     if request.ts is not None:
         blank = jax.tree.map(lambda x: jnp.stack([x] * (stepper.degree + 1)), y0)
         saved = saved.write_times(jnp.ones((), bool), start, start, blank, state.mode, system, direction, reverse)
-    flow = _Flow(
+    flow = Flow(
         model=model,
         stepper=stepper,
         controller=controller,
@@ -409,9 +101,9 @@ def _integrate(
         reverse=reverse,
     )
     zero = jnp.zeros((), jnp.int32)
-    bad = ~_finite((y0, f0, start, stop))
+    bad = ~finite((y0, f0, start, stop))
     result = RESULTS.where(bad, RESULTS.nonfinite_field, result)
-    carry = _Carry(
+    carry = Carry(
         t=start,
         y=y0,
         f=f0,
@@ -437,12 +129,11 @@ def _integrate(
         return jax.tree.map(lambda old, x: x.astype(old.dtype), dynamic, new)
 
     # `unvmap_any` keeps the predicate unbatched, so that ended lanes cost no copy of the buffers.
+    kind = dict(kind="lax")
     if isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
-        options = dict(kind="checkpointed", max_steps=max_steps, checkpoints=adjoint.checkpoints)
-    else:
-        options = dict(kind="lax")
-    dynamic = eqxi.while_loop(lambda c: eqxi.unvmap_any(c.active), body, dynamic, **options)
-    c: _Carry = eqx.combine(dynamic, static)
+        kind = dict(kind="checkpointed", max_steps=max_steps, checkpoints=adjoint.checkpoints)
+    dynamic = eqxi.while_loop(lambda c: eqxi.unvmap_any(c.active), body, dynamic, **kind)
+    c: Carry = eqx.combine(dynamic, static)
     meter.close(c.meter)
     result = RESULTS.where(c.grazed & (c.result == RESULTS.successful), RESULTS.tangential_event, c.result)
     saved = c.saved
@@ -481,7 +172,7 @@ def _row(mode: tuple) -> Int[Array, " switches"]:
     return jnp.stack(mode) if mode else jnp.zeros(0, jnp.int32)
 
 
-def _events(model: Model, c: _Carry, start: State) -> Events:
+def _events(model: Model, c: Carry, start: State) -> Events:
     log = c.log or Log(0, c.y, len(model.switches))
     table = jnp.asarray([s.switch for s in model.slots] + [-1], jnp.int32)
     first = _row(start.mode)[None] if model.switches else jnp.zeros((1, 0), jnp.int32)
@@ -564,19 +255,5 @@ def solve(
     )
     if dt0 is not None:
         dt0 = jnp.abs(jnp.asarray(dt0, t0.dtype))
-    return _run(
-        system,
-        t0,
-        t1,
-        y0,
-        given,
-        solver,
-        controller,
-        saveat,
-        dt0,
-        max_steps,
-        max_events,
-        adjoint,
-        throw,
-        progress_meter,
-    )
+    options = _Options(given, solver, controller, saveat, dt0, max_steps, max_events, adjoint, throw, progress_meter)
+    return _run(system, t0, t1, y0, options)

@@ -28,6 +28,7 @@ ORDER = (
     "_event",
     "_check",
     "_start",
+    "_flow",
     "_solve",
     "_saltation",
     "_variational",

@@ -1,0 +1,332 @@
+"""One turn of the flow's loop: a step of a diffrax solver, or the work at an event.
+
+Under `vmap` every lane is in its own mode and at its own time: it takes a step, or works on its event, and never waits
+for the segments of the others.
+"""
+
+import functools as ft
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from ._compact import compact_cond
+from ._crossing import deflate, elevate, nodes, to_bernstein, to_chebyshev
+from ._event import land, Landing
+from ._filippov import Model, State
+from ._once import once
+from ._save import Log, Saved
+from ._solution import RESULTS
+from ._step import stack, Stepper
+from ._system import frozen
+from ._types import Scalar, Y
+
+
+class Carry(eqx.Module):
+    """What one turn of the loop hands to the next."""
+
+    t: Scalar
+    y: Y
+    f: Y  # the field at (t, y)
+    state: State
+    dt: Scalar
+    controller: PyTree
+    active: Bool[Array, ""]
+    result: RESULTS
+    steps: Int[Array, ""]
+    accepted: Int[Array, ""]
+    events: Int[Array, ""]
+    halted: Int[Array, ""]  # events in a row without progress in time
+    halvings: Int[Array, ""]  # in a row, to resolve a guard
+    grazed: Bool[Array, ""]  # whether an event was tangential
+    log: Log | None
+    saved: Saved
+    meter: PyTree
+
+
+class _Attempt(NamedTuple):
+    """A step of the solver, before it is known whether an event cuts it short."""
+
+    t_next: Scalar
+    y1: Y
+    ks: list[Y]
+    keep: Bool[Array, ""]  # whether it is accepted
+    dt: Scalar  # length of the next
+    halvings: Int[Array, ""]
+    controller: PyTree
+    result: RESULTS
+    coefficients: list[list[list[Scalar]]]  # of the guards along it
+    busy: Bool[Array, ""]  # whether one of them may have a root
+
+
+class Flow(eqx.Module):
+    """One solve: the model, the method, and the body of its loop."""
+
+    model: Model
+    stepper: Stepper
+    controller: dfx.AbstractStepSizeController
+    t0: Scalar
+    t1: Scalar
+    max_steps: int = eqx.field(static=True)
+    max_events: int = eqx.field(static=True)
+    keep_steps: int = eqx.field(static=True)  # every so many steps are saved
+    want_points: bool = eqx.field(static=True)
+    meter: dfx.AbstractProgressMeter
+    affine: tuple[bool, ...] = eqx.field(static=True)  # whether each guard is affine in (t, y)
+    degree: int = eqx.field(static=True)  # of the polynomial for one that is not
+    reverse: bool = eqx.field(static=True)  # whether the loop is to be transposed
+
+    def coefficients(
+        self, t: Scalar, t_next: Scalar, y: Y, y1: Y, ks: list[Y], state: State
+    ) -> tuple[list[list[list[Scalar]]], Bool[Array, ""]]:
+        """Bernstein coefficients `[slot][part][j]` of the guards along a step, and whether they represent them well.
+
+        A guard affine in (t, y) has its values at the control points as coefficients; any other is interpolated, and
+        the size of its last Chebyshev coefficients tells whether a polynomial of that degree can stand for it.
+        """
+        out: list[list[list[Scalar]]] = [[] for _ in self.model.slots]
+        resolved = jnp.ones((), bool)
+        dt = t_next - t
+        if any(self.affine):
+            n = self.stepper.degree
+            rows = [
+                self.model.guards(t + dt * (j / n), point, state)
+                for j, point in enumerate(self.stepper.points(y, y1, ks))
+            ]
+            for i, affine in enumerate(self.affine):
+                if affine:
+                    out[i] = [list(c) for c in zip(*[row[i] for row in rows])]
+        if not all(self.affine):
+            n = self.degree
+            at = [float(u) for u in nodes(n)]
+            samples = self.stepper.samples(y, y1, ks, n)
+            rows = [self.model.guards(t + dt * u, point, state) for u, point in zip(at, samples)]
+            for i, affine in enumerate(self.affine):
+                if affine:
+                    continue
+                for values in zip(*[row[i] for row in rows]):
+                    v = jnp.stack(values)
+                    tail = jnp.max(jnp.abs(jnp.asarray(to_chebyshev(n)[-2:], t.dtype) @ v))
+                    resolved = resolved & ~(tail > max(1e-7, 64 * float(jnp.finfo(t.dtype).eps)) * jnp.max(jnp.abs(v)))
+                    out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ v))
+        return out, resolved
+
+    def stacked(self, coefficients: list[list[list[Scalar]]]) -> Float[Array, "slots parts coefficients"]:
+        """The same as one array, of one degree, known roots at the start of the step divided out of it."""
+        n = self.stepper.degree if all(self.affine) else self.degree
+        dtype = self.t0.dtype
+        rows = [
+            [
+                jnp.stack(c) if len(c) == n + 1 else jnp.asarray(elevate(len(c) - 1, n), dtype) @ jnp.stack(c)
+                for c in row
+            ]
+            for row in coefficients
+        ]
+        return self.model.stacked(rows, -1.0)
+
+    def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list) -> Landing:
+        """The step once more, to its first event."""
+        coefficients = lax.stop_gradient(coefficients)
+        known = self.model.stacked(self.model.known_roots(state), 0)
+        polynomials = deflate(self.stacked(coefficients), known)
+        return land(self.model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials)
+
+    def attempt(self, c: Carry) -> _Attempt:
+        """A step of the solver, its error against the tolerance, and whether a guard may have a root on it."""
+        model, stepper = self.model, self.stepper
+
+        def flow(t: Scalar, y: Y) -> Y:
+            return model.flow(t, y, c.state)
+
+        t_next = jnp.where(c.t + c.dt >= self.t1, self.t1, c.t + c.dt)
+        y1, error, ks, _ = stepper(flow, c.t, t_next, c.y, c.f)
+        # An error that is not a number is too large.
+        error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
+        terms = dfx.ODETerm(lambda t, y, args: flow(t, y))
+        # The step size is no function to be differentiated; powers of an error of zero are not even differentiable.
+        t_still, t_next_still, y_still, y1_still, error = frozen((c.t, t_next, c.y, y1, error))
+        # A step that overflows is too long, but must not make the next one infinity divided by infinity.
+        y1_still = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), y1_still, y_still)
+        order = stepper.solver.error_order(terms)
+        keep, a, b, _, controller, outcome = self.controller.adapt_step_size(
+            t_still, t_next_still, y_still, y1_still, None, error, order, c.controller
+        )
+        dt, halvings, result = b - a, c.halvings, RESULTS.promote(outcome)
+        coefficients, busy = [], jnp.zeros((), bool)
+        if model.slots:
+            coefficients, resolved = self.coefficients(c.t, t_next, c.y, y1, ks, c.state)
+            is_finite, quiet = _survey(coefficients, model.known_roots(c.state))
+            result = RESULTS.where(keep & ~is_finite, RESULTS.nonfinite_field, result)
+            # A guard that is no polynomial to the precision needed is not trusted: a shorter step is. (At most so
+            # often: one with a kink never is.)
+            # Nor is a step so short that rounding of time alone spoils the polynomial.
+            eps = float(jnp.finfo(c.t.dtype).eps)
+            floor = 4 * eps / max(1e-7, 64 * eps) * jnp.maximum(jnp.abs(c.t), self.t1 - self.t0)
+            poor = keep & is_finite & ~resolved & (halvings < 30) & (t_next - c.t > floor)
+            halvings = jnp.where(poor, halvings + 1, jnp.where(keep, 0, halvings))
+            keep = keep & ~poor
+            dt = jnp.where(poor, 0.5 * (t_next - c.t), dt)
+            # On the last few ulps before the end the polynomials are rounding.
+            busy = c.active & keep & is_finite & ~quiet & (t_next - c.t > 4 * eps * jnp.abs(c.t))
+        return _Attempt(t_next, y1, ks, keep & c.active, dt, halvings, controller, result, coefficients, busy)
+
+    def arrive(self, c: Carry, step: _Attempt) -> Landing:
+        """Where the step leads: to its end, or to the first event on it."""
+        model = self.model
+
+        def flow(t: Scalar, y: Y) -> Y:
+            return model.flow(t, y, c.state)
+
+        t, no = step.t_next, jnp.zeros((), bool)
+        y_end = model.project(t, step.y1, c.state)
+        points = stack(self.stepper.points(c.y, step.y1, step.ks)) if self.want_points else None
+        end = Landing(
+            found=no,
+            t=t,
+            t_after=t,
+            y_before=step.y1,
+            y_after=y_end,
+            f_after=self.stepper.last_slope(step.ks, t - c.t, flow, t, y_end),
+            state=c.state,
+            slot=jnp.zeros((), jnp.int32),
+            news=no,
+            points=points,
+            transversality=jnp.ones_like(t),
+            grazes=no,
+            result=RESULTS.successful,
+        )
+        if not model.slots:
+            return end
+        here = (c.t, t, c.y, c.f, c.state, lax.stop_gradient(step.coefficients))
+        there = _landed(step.busy, self, here, end)
+        # A lane that looked for a root may have found none.
+        event = step.busy & there.found
+        there = jax.tree.map(lambda a, b: jnp.where(event, a, b), there, end)
+        return there._replace(
+            state=there.state._replace(roots=tuple(jnp.where(event, r, 0) for r in there.state.roots))
+        )
+
+    def body(self, c: Carry) -> Carry:
+        model = self.model
+        step = self.attempt(c)
+        there = self.arrive(c, step)
+        event, result = there.found, step.result
+        # What happened to this lane: an event, an accepted step, a rejected one, or nothing as it has ended.
+        moved = step.keep | event
+        events, halted, grazed, log = c.events, c.halted, c.grazed, c.log
+        if model.slots:
+            assert log is not None
+            at, news = there.t_after * model.direction, event & there.news
+            row = (at, there.y_before, there.y_after, there.slot, there.state.mode, there.transversality)
+            log = log.write(events, news, *row)
+            grazed = grazed | (event & there.grazes)
+            events = events + news.astype(jnp.int32)
+            halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(step.keep, 0, halted))
+            result = RESULTS.where(event, there.result, result)
+            result = RESULTS.where(halted > 8 + 4 * len(model.switches), RESULTS.stuck_in_events, result)
+        accepted = c.accepted + moved.astype(jnp.int32)
+
+        def choose(which: Any, new: Any, old: Any) -> Any:
+            return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
+
+        new = (there.t_after, there.y_after, there.f_after, there.state)
+        t, y, f, state = choose(moved, new, (c.t, c.y, c.f, c.state))
+        steps = c.steps + c.active.astype(jnp.int32)
+        done = t >= self.t1
+        result = self.verdict(c, step, t, y, f, moved, steps, events, done, result)
+        active = c.active & ~done & (result == RESULTS.successful)
+        return Carry(
+            t=t,
+            y=y,
+            f=f,
+            state=state,
+            dt=choose(c.active, step.dt, c.dt),
+            controller=choose(c.active, step.controller, c.controller),
+            active=active,
+            result=result,
+            steps=steps,
+            accepted=accepted,
+            events=events,
+            halted=halted,
+            halvings=step.halvings,
+            grazed=grazed,
+            log=log,
+            saved=self.save(c, there, moved, accepted),
+            meter=self.meter.step(c.meter, jnp.where(active, (t - self.t0) / (self.t1 - self.t0), 1.0)),
+        )
+
+    def save(self, c: Carry, there: Landing, moved: Bool[Array, ""], accepted: Int[Array, ""]) -> Saved:
+        """What `saveat` asks for of this turn; at an event the states before and after it."""
+        system, direction = self.model.system, self.model.direction
+        saved = c.saved
+        if saved.request.ts is not None:
+            saved = saved.write_times(moved, c.t, there.t, there.points, c.state.mode, system, direction, self.reverse)
+        saved = saved.write_step(moved, c.accepted, c.t, there.t, there.points)
+        if self.keep_steps:
+            due = moved & ((accepted % self.keep_steps == 0) | there.found)
+            saved = saved.write(due, there.t, there.y_before, c.state.mode, system, direction)
+            after = (there.t_after, there.y_after, there.state.mode)
+            saved = saved.write(due & there.found, *after, system, direction)
+        return saved
+
+    def verdict(
+        self,
+        c: Carry,
+        step: _Attempt,
+        t: Scalar,
+        y: Y,
+        f: Y,
+        moved: Bool[Array, ""],
+        steps: Int[Array, ""],
+        events: Int[Array, ""],
+        done: Bool[Array, ""],
+        result: RESULTS,
+    ) -> RESULTS:
+        """Whether the lane can go on."""
+        good = result == RESULTS.successful
+        result = RESULTS.where((steps >= self.max_steps) & ~done & good, RESULTS.max_steps_reached, result)
+        if self.model.slots:
+            full = (events >= self.max_events) & ~done & (result == RESULTS.successful)
+            result = RESULTS.where(full, RESULTS.max_events_reached, result)
+        result = RESULTS.where(~finite((y, f)), RESULTS.nonfinite_field, result)
+        # Rejected again and again, down to nothing: at a place where the field ends, or where it is too rough.
+        least = 1e-6 * float(jnp.finfo(t.dtype).eps) * (self.t1 - self.t0)
+        tiny = ~moved & ((t + step.dt <= t) | (step.dt <= least)) & (result == RESULTS.successful)
+        ended = ~finite(step.y1)
+        result = RESULTS.where(tiny & ended, RESULTS.nonfinite_field, result)
+        result = RESULTS.where(tiny & ~ended, RESULTS.dt_min_reached, result)
+        return RESULTS.where(c.active, result, c.result)
+
+
+def _survey(coefficients: list, known: list) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether all coefficients are finite, and whether certainly no guard has a root on the step: one of its parts is
+    positive in all coefficients but those which vanish with its known roots."""
+
+    def least(c: list[Scalar], roots: Int[Array, ""]) -> Scalar:
+        return ft.reduce(jnp.minimum, [jnp.where(j < roots, 1, x) if j < 3 else x for j, x in enumerate(c)])
+
+    rows = [ft.reduce(jnp.maximum, map(least, row, roots)) for row, roots in zip(coefficients, known)]
+    return finite(coefficients), once(ft.reduce(jnp.minimum, rows)) > 0
+
+
+def finite(tree: Any) -> Bool[Array, ""]:
+    """Whether all numbers are finite: only then are all of their products with zero."""
+    return once(sum(jnp.sum(0 * x) for x in jax.tree.leaves(tree))) == 0
+
+
+def _landed(pred: Any, flow: Flow, here: tuple, default: Landing) -> Landing:
+    """`flow.land(*here)` for lanes with work to do, else `default`."""
+    dynamic, static = eqx.partition((flow, here), eqx.is_array)
+    dynamic_default, static_default = eqx.partition(default, eqx.is_array)
+
+    def branch(dynamic: Any) -> Any:
+        flow, here = eqx.combine(dynamic, static)
+        return eqx.filter(flow.land(*here), eqx.is_array)
+
+    if flow.reverse:  # `compact_cond` knows no transposition
+        return eqx.combine(lax.cond(pred, branch, lambda _: dynamic_default, dynamic), static_default)
+    return eqx.combine(compact_cond(pred, branch, (dynamic,), dynamic_default), static_default)
