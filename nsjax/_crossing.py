@@ -77,6 +77,14 @@ def elevate(degree: int, to: int) -> np.ndarray:
     return matrix
 
 
+def bend(c: Float[Array, " coefficients"], u: Scalar) -> Scalar:
+    """The second derivative at `u` (which may be a little outside of [0, 1]), up to a positive factor."""
+    c = c[2:] - 2 * c[1:-1] + c[:-2]
+    while c.shape[0] > 1:
+        c = (1 - u) * c[:-1] + u * c[1:]
+    return c[0] if c.shape[0] else jnp.zeros_like(u)
+
+
 def no_root(c: Float[Array, "... parts coefficients"]) -> Bool[Array, "..."]:
     """Whether the maximum over the parts is certainly positive on the whole step."""
     return jnp.any(jnp.all(c > 0, axis=-1), axis=-1)

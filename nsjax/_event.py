@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._crossing import first_root
+from ._crossing import bend, first_root
 from ._filippov import Model, State
 from ._settle import settle
 from ._solution import RESULTS
@@ -292,8 +292,9 @@ def land(
         news = news | (state_after.mode[k] != state.mode[k])
         if isinstance(switch, impact):
             news = news | fired[k]
-    cosine, bend = transversality(model, te, before, state, slot, part)
-    grazes = found & news & ~halted & (cosine < jnp.cbrt(jnp.finfo(te.dtype).eps)) & (bend > 0)
+    cosine = transversality(model, te, before, state, slot, part)
+    bends = bend(coefficients[slot, part], (te - t) / jnp.where(halted, 1, t_next - t)) > 0
+    grazes = found & news & ~halted & bends & (cosine < jnp.cbrt(jnp.finfo(te.dtype).eps))
     points = None
     if want_points:
         # Once more, to the very event and with the derivatives of where it begins and ends.
@@ -303,26 +304,18 @@ def land(
     return Landing(found, te, t_after, before, after, f_after, state_after, slot, news, points, cosine, grazes, result)
 
 
-def transversality(
-    model: Model, t: Scalar, y: Y, state: State, slot: Int[Array, ""], part: Int[Array, ""]
-) -> tuple[Scalar, Scalar]:
-    """The cosine between the trajectory and the normal of the surface it meets, in time and state, and the second
-    derivative of the guard along the trajectory."""
+def transversality(model: Model, t: Scalar, y: Y, state: State, slot: Int[Array, ""], part: Int[Array, ""]) -> Scalar:
+    """The cosine between the trajectory and the normal of the surface it meets, in time and state."""
     model, t, y = frozen((model, t, y))
     flat, unravel = jfu.ravel_pytree(y)
-    f = model.flow(t, y, state)
 
-    def guard(t: Scalar, y: Y) -> Scalar:
-        return model.stacked(model.guards(t, y, state), -1.0)[slot, part]
+    def guard(t: Scalar, x: Array) -> Scalar:
+        return model.stacked(model.guards(t, unravel(x), state), -1.0)[slot, part]
 
-    def rate(t: Scalar, y: Y) -> Scalar:
-        return jax.jvp(guard, (t, y), (jnp.ones_like(t), model.flow(t, y, state)))[1]
-
-    fall, bend = jax.jvp(rate, (t, y), (jnp.ones_like(t), f))
-    h_t, n = jax.grad(lambda t, x: guard(t, unravel(x)), argnums=(0, 1))(t, flat)
-    flow = jfu.ravel_pytree(f)[0]
-    size = (n @ n + h_t**2) * (flow @ flow + jnp.where(h_t == 0, 0, 1))
-    return jnp.abs(fall) / jnp.sqrt(size), bend
+    h_t, n = jax.grad(guard, argnums=(0, 1))(t, flat)
+    f = jfu.ravel_pytree(model.flow(t, y, state))[0]
+    size = (n @ n + h_t**2) * (f @ f + jnp.where(h_t == 0, 0, 1))
+    return jnp.abs(n @ f + h_t) / jnp.sqrt(size)
 
 
 class Completed(NamedTuple):

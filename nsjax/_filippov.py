@@ -238,13 +238,17 @@ class Model(eqx.Module):
     def width(self) -> int:
         return max(self.parts, default=1)
 
-    def guards(self, t: Scalar, y: Y, state: State) -> list[list[Scalar]]:
-        """`guards[slot][part]`, as scalars: stacked arrays of length two or five cost XLA's CPU code several times as
-        much."""
+    def guards(self, t: Scalar, y: Y, state: State, wanted: tuple[bool, ...] | None = None) -> list[list[Scalar]]:
+        """`guards[slot][part]` (of the slots that are `wanted`, else empty), as scalars: stacked arrays of two or
+        five cost XLA's CPU code several times as much."""
         one = jnp.ones((), t.dtype)
-        s = self.values(t, y, state) if self.holdable else ()
+        wanted = (True,) * len(self.slots) if wanted is None else wanted
+        s = self.values(t, y, state) if any(w and slot.holding for w, slot in zip(wanted, self.slots)) else ()
         rows = []
-        for slot in self.slots:
+        for slot, want in zip(self.slots, wanted):
+            if not want:
+                rows.append([])
+                continue
             k, switch, mode = slot.switch, self.switches[slot.switch], state.mode[slot.switch]
             if slot.holding:
                 left = s[k] if k in self.contacts else self.bound(k) - slot.part * s[k]

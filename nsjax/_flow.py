@@ -91,28 +91,29 @@ class Flow(eqx.Module):
         out: list[list[list[Scalar]]] = [[] for _ in self.model.slots]
         resolved = jnp.ones((), bool)
         dt = t_next - t
+
+        def sampled(at: list[float], points: list[Y], wanted: tuple[bool, ...]) -> list[tuple[int, list[Scalar]]]:
+            """(slot, values along the step) for every part of the guards that are wanted."""
+            if len(self.model.holdable) > 1:  # the multipliers of all points by one call of the linear solver
+                ts = t + dt * jnp.asarray(at, t.dtype)
+                batch = jax.vmap(lambda t, y: self.model.guards(t, y, state, wanted))(ts, stack(points))
+                rows = [jax.tree.map(lambda x, j=j: x[j], batch) for j in range(len(at))]
+            else:
+                rows = [self.model.guards(t + dt * u, y, state, wanted) for u, y in zip(at, points)]
+            return [(i, list(part)) for i, _ in enumerate(wanted) for part in zip(*[row[i] for row in rows])]
+
         if any(self.affine):
             n = self.stepper.degree
-            rows = [
-                self.model.guards(t + dt * (j / n), point, state)
-                for j, point in enumerate(self.stepper.points(y, y1, ks))
-            ]
-            for i, affine in enumerate(self.affine):
-                if affine:
-                    out[i] = [list(c) for c in zip(*[row[i] for row in rows])]
+            for i, values in sampled([j / n for j in range(n + 1)], self.stepper.points(y, y1, ks), self.affine):
+                out[i].append(values)
         if not all(self.affine):
             n = self.degree
-            at = [float(u) for u in nodes(n)]
-            samples = self.stepper.samples(y, y1, ks, n)
-            rows = [self.model.guards(t + dt * u, point, state) for u, point in zip(at, samples)]
-            for i, affine in enumerate(self.affine):
-                if affine:
-                    continue
-                for values in zip(*[row[i] for row in rows]):
-                    v = jnp.stack(values)
-                    tail = jnp.max(jnp.abs(jnp.asarray(to_chebyshev(n)[-2:], t.dtype) @ v))
-                    resolved = resolved & ~(tail > max(1e-7, 64 * float(jnp.finfo(t.dtype).eps)) * jnp.max(jnp.abs(v)))
-                    out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ v))
+            others = tuple(not affine for affine in self.affine)
+            for i, values in sampled([float(u) for u in nodes(n)], self.stepper.samples(y, y1, ks, n), others):
+                v = jnp.stack(values)
+                tail = jnp.max(jnp.abs(jnp.asarray(to_chebyshev(n)[-2:], t.dtype) @ v))
+                resolved = resolved & ~(tail > max(1e-7, 64 * float(jnp.finfo(t.dtype).eps)) * jnp.max(jnp.abs(v)))
+                out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ v))
         return out, resolved
 
     def stacked(self, coefficients: list[list[list[Scalar]]]) -> Float[Array, "slots parts coefficients"]:

@@ -182,8 +182,8 @@ def test_friction_by_the_contact_force():
 def test_fundamental_matrix_through_rest():
     """Two routes, while it slides at rest and after it sticks."""
     y0, ts = Thrown(0.0, 0.5, 5.0, 0.0), jnp.array([1.2, 5.0])
-    formula = nsjax.fundamental_matrix(Block(), 0.0, 5.0, y0, ts=ts)
-    autodiff = nsjax.fundamental_matrix(Block(), 0.0, 5.0, y0, ts=ts, method="autodiff")
+    formula = nsjax.fundamental_matrix(Block(), 0.0, 5.0, y0, ts=ts, solver=dfx.Tsit5())
+    autodiff = nsjax.fundamental_matrix(Block(), 0.0, 5.0, y0, ts=ts, solver=dfx.Tsit5(), method="autodiff")
     np.testing.assert_allclose(formula, autodiff, atol=1e-6)
     np.testing.assert_allclose(autodiff[:, 1::2], 0, atol=1e-12)  # z and its rate are known
     d = 1e-6
