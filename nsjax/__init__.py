@@ -6,7 +6,15 @@ from ._saltation import (
     saltation_matrices as saltation_matrices,
     saltation_matrix as saltation_matrix,
 )
-from ._solution import Event as Event, Events as Events, is_okay as is_okay, RESULTS as RESULTS, Solution as Solution
+from ._sensitivity import Sensitivity as Sensitivity, sensitivity as sensitivity
+from ._solution import (
+    Event as Event,
+    Events as Events,
+    is_okay as is_okay,
+    Itinerary as Itinerary,
+    RESULTS as RESULTS,
+    Solution as Solution,
+)
 from ._solve import solve as solve
 from ._system import impact as impact, relay as relay, sgn as sgn, System as System
 from ._variational import fundamental_matrix as fundamental_matrix

@@ -34,6 +34,7 @@ class Landing(NamedTuple):
     points: Y | None  # control points of the step to the event, if asked for
     transversality: Scalar
     grazes: Bool[Array, ""]  # whether it was so tangential that it has no derivative
+    forked: Bool[Array, ""]  # whether another solution goes on from here too
     result: RESULTS
 
 
@@ -272,7 +273,11 @@ def land(
     # What cannot be held crosses when it fires, but for the residual of an event a few ulps earlier, which dh/dt tells.
     crosses = {k: fired[k] & ~(halted & (state.roots[k] == 0)) for k in fired}
     bounds = {k: b if k in model.holdable else crosses[k].astype(jnp.int32) for k, b in bounds.items()}
-    state_after, _, wrong = settle(model, t_after, after, state_after, at, bounds)
+    state_after, _, forked, wrong = settle(model, t_after, after, state_after, at, bounds)
+    # Run backwards, what slides or rests is what solutions that run forwards leave or join there.
+    for k in model.holdable:
+        entered = model.held(k, state_after.mode[k]) & ~model.held(k, state.mode[k])
+        forked = forked | (entered & (model.direction < 0))
     result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
     if model.contacts:
         after = model.project(t_after, after, state_after)
@@ -301,7 +306,9 @@ def land(
         _, increments = _step_to(te, stepper, (model, t, y, f0, state))
         points = stack(stepper.points(y, before, increments))
     f_after = model.flow(t_after, after, state_after)
-    return Landing(found, te, t_after, before, after, f_after, state_after, slot, news, points, cosine, grazes, result)
+    return Landing(
+        found, te, t_after, before, after, f_after, state_after, slot, news, points, cosine, grazes, forked, result
+    )
 
 
 def transversality(model: Model, t: Scalar, y: Y, state: State, slot: Int[Array, ""], part: Int[Array, ""]) -> Scalar:

@@ -43,6 +43,7 @@ class Carry(eqx.Module):
     halted: Int[Array, ""]  # events in a row without progress in time
     halvings: Int[Array, ""]  # in a row, to resolve a guard
     grazed: Bool[Array, ""]  # whether an event was tangential
+    forked: Bool[Array, ""]  # whether another solution sets out from the start too, or branches off on the way
     log: Log | None
     saved: Saved
     meter: PyTree
@@ -198,6 +199,7 @@ class Flow(eqx.Module):
             points=points,
             transversality=jnp.ones_like(t),
             grazes=no,
+            forked=no,
             result=RESULTS.successful,
         )
         if not model.slots:
@@ -218,13 +220,13 @@ class Flow(eqx.Module):
         event, result = there.found, step.result
         # What happened to this lane: an event, an accepted step, a rejected one, or nothing as it has ended.
         moved = step.keep | event
-        events, halted, grazed, log = c.events, c.halted, c.grazed, c.log
+        events, halted, grazed, forked, log = c.events, c.halted, c.grazed, c.forked, c.log
         if model.slots:
             assert log is not None
             at, news = there.t_after * model.direction, event & there.news
             row = (at, there.y_before, there.y_after, there.slot, there.state.mode, there.transversality)
             log = log.write(events, news, *row)
-            grazed = grazed | (event & there.grazes)
+            grazed, forked = grazed | (event & there.grazes), forked | (event & there.forked)
             events = events + news.astype(jnp.int32)
             halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(step.keep, 0, halted))
             result = RESULTS.where(event, there.result, result)
@@ -255,6 +257,7 @@ class Flow(eqx.Module):
             halted=halted,
             halvings=step.halvings,
             grazed=grazed,
+            forked=forked,
             log=log,
             saved=self.save(c, there, moved, accepted),
             meter=self.meter.step(c.meter, jnp.where(active, (t - self.t0) / (self.t1 - self.t0), 1.0)),

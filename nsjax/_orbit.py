@@ -17,7 +17,7 @@ from ._check import check_solve
 from ._filippov import Model
 from ._jacobian import dense_jacobian
 from ._saltation import _states
-from ._solution import Events, is_okay, RESULTS, Solution
+from ._solution import Events, is_okay, Itinerary, RESULTS, Solution
 from ._solve import solve
 from ._system import arrays_of, frozen, relay, sgn, System
 from ._types import Scalar, Y
@@ -54,11 +54,10 @@ class Orbit(eqx.Module):
     method: tuple[tuple[str, Any], ...] = eqx.field(static=True)
 
     @property
-    def itinerary(self) -> tuple[dict[str, int], ...]:
+    def itinerary(self) -> Itinerary:
         """The modes the orbit passes through, beginning with that of its base point."""
-        names = self.events.names
-        rows = [self.mode, *self.events.mode_after[: len(self.events)]]
-        return tuple({n: int(m) for n, m in zip(names, row)} for row in rows)
+        e = self.events
+        return Itinerary(self.mode, e.switch, e.mode_after, e.num, e.names)
 
     def solve(self, *, saveat: dfx.SaveAt = dfx.SaveAt(dense=True), periods: float = 1, **kwargs: Any) -> Solution:
         """The solution over one or several periods from the base point; further arguments as for `nsjax.solve`."""
@@ -68,13 +67,12 @@ class Orbit(eqx.Module):
 
     def __str__(self) -> str:
         state = ", ".join(f"{x:.12g}" for x in _flat(self.y0))
-        modes = " -> ".join(", ".join(f"{n} {m:+d}" for n, m in row.items()) for row in self.itinerary)
         multipliers = ", ".join(f"{complex(m):.6g}" for m in self.multipliers)
         return (
             f"{'stable' if self.stable else 'unstable'} periodic orbit of {type(self.system).__name__}\n"
             f"  period       {float(self.period):.15g}\n"
             f"  base point   t = {float(self.t0):.6g}, y = ({state})\n"
-            f"  itinerary    {modes}\n"
+            f"  itinerary    {self.itinerary}\n"
             f"  multipliers  {multipliers}\n"
             f"  residual     {float(self.residual):.1e}\n"
         )
@@ -214,12 +212,11 @@ def _shoot(
     if autonomous:
         inside = inside.at[jnp.argmin(jnp.abs(multipliers - 1))].set(True)
     events = sol.events
-    first = jnp.where(events.num > 0, events.mode_before[0], sol.mode1) if events.t.size else sol.mode1
     return Orbit(
         system=system,
         t0=t0,
         y0=unravel(x),
-        mode=first,
+        mode=sol.mode0,
         period=period,
         events=events,
         monodromy=monodromy,

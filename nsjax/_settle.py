@@ -24,7 +24,7 @@ def settle(
     state: State,
     at: dict[int, Bool[Array, ""]],
     leaves: dict[int, Int[Array, ""]],
-) -> tuple[State, Bool[Array, ""], Bool[Array, ""]]:
+) -> tuple[State, Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
     """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}, every contact one from {1, 0}.
 
     All of them hold if that is valid (|λ| <= b, a contact force λ >= 0), else as many as can be. Of up to three
@@ -39,14 +39,14 @@ def settle(
     - `at`: for each `sgn` switch whether it is at its surface, for each contact whether it rests there (dh/dt = 0).
     - `leaves`: for each switch the sign with which its λ just reached its bound, else 0.
 
-    **Returns:** the new state, whether the solution is not unique (a repulsive surface (2.25) met without a side), and
-    whether not exactly one assignment was found.
+    **Returns:** the new state; whether a side must be chosen (a repulsive surface (2.25) met without one); whether one
+    was chosen by rule, see `forks`; and whether not exactly one assignment was found.
     """
     model, t, y = frozen((model, t, y))  # modes have no derivative
     which = tuple(at)
     false = jnp.zeros((), bool)
     if not which:
-        return state, false, false
+        return state, false, false, false
     mode = dict(enumerate(state.mode))
     came = {k: mode[k] for k in which}
 
@@ -69,6 +69,10 @@ def settle(
             trial[k] = jnp.where(at[k], 0, mode[k])
     s, rates, slopes = look(trial)
     repels = {k: slopes[k] >= 0 for k in which}
+    forked = false
+    for k in which:
+        if k in model.holdable and k not in model.contacts:
+            forked = forked | (at[k] & (came[k] != 0) & (leaves[k] == 0) & forks(model, k, s[k], slopes[k]))
     for k in which:
         if k in model.contacts:
             continue
@@ -126,7 +130,16 @@ def settle(
             unsure = unsure | (at[k] & (trial[k] == 0) & (slopes[k] > 0) & (came[k] == 0))
         roots[k] = jnp.where(at[k], fresh, roots[k]).astype(jnp.int32)
     state = state._replace(mode=tuple(m.astype(jnp.int32) for m in trial.values()), roots=tuple(roots))
-    return state, unsure, wrong
+    return state, unsure, forked, wrong
+
+
+def forks(model: Model, k: int, multiplier: Scalar, slope: Scalar) -> Bool[Array, ""]:
+    """Whether `sgn` switch k, at its surface, can hold the solution there (|λ| <= b) and let it go as well: because the
+    surface repels, or because |λ| > 1, so that on both sides the fields point the same way.
+
+    The rule is that a repulsive surface is crossed, and that static friction holds."""
+    size = jnp.abs(multiplier)
+    return (size <= model.bound(k)) & ((slope > 0) | (size > 1 + _nearly(size)))
 
 
 def _nearly(like: Scalar) -> float:

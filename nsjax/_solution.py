@@ -32,8 +32,8 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "and the state at the accumulation point."
     )
     repulsive_sliding = (
-        "The start lies on a surface which both fields leave (2.25): the solution is not unique. Choose one by "
-        "`mode={'name': 0}` to stay on the surface, or +1 or -1 to leave it to that side."
+        "The start lies on a surface that repels (2.25) but can hold the solution too, which is therefore not unique. "
+        "Choose one by `mode={'name': 0}` to stay on the surface, or +1 or -1 to leave it to that side."
     )
     ambiguous_event = (
         "Several switches met their surfaces at one instant, and no combination of sticking and slipping satisfies all "
@@ -135,17 +135,54 @@ class Events(eqx.Module):
         return "\n".join(lines) or "no events"
 
 
+class Itinerary(eqx.Module):
+    """The modes that a solution passes through, with the switches whose events lead from one to the next.
+
+    Iterating yields each mode as a dictionary. (A reset leads from a mode to itself.)
+    """
+
+    first: Int[Array, " switches"]
+    switch: Int[Array, " events"]
+    modes: Int[Array, "events switches"]  # after each event
+    num: Int[Array, ""]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def same_as(self, other: "Itinerary") -> Bool[Array, ""]:
+        """Whether two solutions have the same events in the same order (for batches lane by lane)."""
+        if self.names != other.names:
+            raise ValueError(f"Itineraries of different systems: switches {self.names} and {other.names}.")
+        n = min(self.switch.shape[-1], other.switch.shape[-1])
+        equal = (self.switch[..., :n] == other.switch[..., :n]) & jnp.all(
+            self.modes[..., :n, :] == other.modes[..., :n, :], axis=-1
+        )
+        padding = jnp.arange(n, dtype=self.num.dtype) >= self.num[..., None]
+        same = (self.num == other.num) & jnp.all(self.first == other.first, axis=-1)
+        return same & jnp.all(equal | padding, axis=-1)
+
+    def __iter__(self) -> Iterator[dict[str, int]]:
+        for row in [self.first, *self.modes[: int(self.num)]]:
+            yield {n: int(m) for n, m in zip(self.names, row)}
+
+    def __str__(self) -> str:
+        return " -> ".join(", ".join(f"{n} {m:+d}" for n, m in row.items()) for row in self)
+
+
 class Solution(eqx.Module):
     """The solution of a piecewise-smooth system.
 
     **Attributes:**
 
     - `t0`, `t1`: where it starts and where it ended (before the requested end if it failed or accumulated).
+    - `mode0`: the mode in which it sets out.
     - `y1`, `mode1`: the state and the mode at `t1`.
     - `ts`, `ys`, `modes`: what `saveat` asked for, in order of time, padded with infinities (modes with -128).
     - `events`: the event log.
     - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`, `num_events`.
     - `result`: `RESULTS`; why it ended.
+    - `unique`: False where it is known not to be the only solution of the inclusion: its start, or an arrival at a
+        surface, lies where a surface may hold the solution as well as let it go (repulsion sliding, chosen by `mode`;
+        example 2.5; static friction that holds with |λ| > 1), or it runs backwards and slides or rests. Derivatives are
+        those among solutions of the same choice.
 
     With `SaveAt(dense=True)`, `sol(t)` is the state at any time; at the instant of an event it is the state before
     with `left=True` (the default) and the state after with `left=False`.
@@ -154,6 +191,7 @@ class Solution(eqx.Module):
     system: System
     t0: Scalar
     t1: Scalar
+    mode0: Int[Array, " switches"]
     y1: Y
     mode1: Int[Array, " switches"]
     ts: Float[Array, " times"] | None
@@ -162,7 +200,14 @@ class Solution(eqx.Module):
     events: Events
     stats: dict[str, Any]
     result: RESULTS
+    unique: Bool[Array, ""]
     dense: Any = None  # (end times of steps, control points) in internal time, and its direction
+
+    @property
+    def itinerary(self) -> Itinerary:
+        """The modes it passes through."""
+        e = self.events
+        return Itinerary(self.mode0, e.switch, e.mode_after, e.num, e.names)
 
     def evaluate(self, t: Any, left: bool = True) -> Y:
         """The state at time `t` (scalar); at an event the one before it, or after it with `left=False`."""

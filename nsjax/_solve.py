@@ -68,7 +68,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     start = check_contacts(model, start, y0)
     stepper = Stepper(solver)
     max_events = max_events if model.slots else 0
-    state, result = start_mode(model, start, y0, given)
+    state, forked, result = start_mode(model, start, y0, given)
     f0 = model.flow(start, y0, state)
 
     def guard(i: int, ty: tuple[Scalar, Y]) -> list[Scalar]:
@@ -118,6 +118,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         halted=zero,
         halvings=zero,
         grazed=jnp.zeros((), bool),
+        forked=forked,
         log=Log(max_events, y0, len(model.switches)) if model.slots else None,
         saved=saved,
         meter=meter.init(),
@@ -143,6 +144,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         system=system,
         t0=t0,
         t1=c.t * direction,
+        mode0=_row(state.mode),
         y1=c.y,
         mode1=_row(c.state.mode),
         ts=saved.ts,
@@ -157,6 +159,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
             "max_steps": max_steps,
         },
         result=result,
+        unique=~c.forked,
         dense=None if saved.dense is None else (*saved.dense, direction, c.accepted),
     )
     if throw:
@@ -223,7 +226,8 @@ def solve(
     - `y0`: the state at `t0`, any pytree of floating point arrays of one dtype.
     - `mode`: for a start on a surface, `{"name": value}` or one value for each switch: `sgn` +1, -1, or 0 to slide
         (also on a repulsive surface); `relay` 0 or 1 (needed between its two surfaces, 0 by default); `impact` 0 or 1
-        to rest.
+        to rest. Where the solution is not unique this chooses one; without it static friction holds as long as it can,
+        a repulsive surface that is reached is crossed, and a start on one is refused. `Solution.unique` tells.
     - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, or Euler.
     - `stepsize_controller`: by default `diffrax.PIDController` with `rtol = atol = 1e-8` (1e-5 for float32).
     - `saveat`: as in diffrax: `t0`, `t1`, `ts`, `steps`, `fn(t, y, system)`, `dense`.

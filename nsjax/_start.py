@@ -4,16 +4,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from ._filippov import Model, State
-from ._settle import settle
+from ._settle import forks, settle
 from ._solution import RESULTS
 from ._system import impact, relay
 from ._types import Scalar, Y
 
 
-def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[State, RESULTS]:
-    """The mode in which the solution sets out: from the signs of h, from `mode=`, and on a surface by the fields."""
+def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[State, Bool[Array, ""], RESULTS]:
+    """The mode in which the solution sets out: from the signs of h, from `mode=`, and on a surface by the fields; and
+    whether another solution sets out there too."""
     modes, parts, roots, at = [], [], [], {}
     result = RESULTS.successful
     on = {}
@@ -63,7 +65,10 @@ def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[St
             modes.append(jnp.where(on[k], 0, jnp.sign(h)).astype(jnp.int32))
             at[k] = on[k]
     state = State(tuple(modes), tuple(parts), tuple(roots))
-    state, unsure, wrong = settle(model, t, y, state, at, {k: jnp.zeros((), jnp.int32) for k in at})
+    forked = _forked(model, t, y, state, on)
+    state, unsure, _, wrong = settle(model, t, y, state, at, {k: jnp.zeros((), jnp.int32) for k in at})
+    for k in model.holdable:  # see `land`
+        forked = forked | (model.held(k, state.mode[k]) & (model.direction < 0))
     result = RESULTS.where(unsure, RESULTS.repulsive_sliding, result)
     result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
     # Guards of surfaces on which the start lies have a root there already.
@@ -76,7 +81,21 @@ def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[St
         fresh = jnp.where(jnp.abs(rate) > scale, 1, 2)
         settled = at.get(k, jnp.zeros((), bool))
         roots[k] = jnp.where(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
-    return state._replace(roots=tuple(roots)), result
+    return state._replace(roots=tuple(roots)), forked, result
+
+
+def _forked(model: Model, t: Scalar, y: Y, state: State, on: dict[int, Bool[Array, ""]]) -> Bool[Array, ""]:
+    """Whether one of the surfaces on which the start lies (`on`) can hold the solution as well as let it go."""
+    dry = [(i, k) for i, k in enumerate(model.holdable) if k not in model.contacts]
+    if not dry:
+        return jnp.zeros((), bool)
+    held = list(state.mode)
+    for _, k in dry:
+        held[k] = jnp.where(on[k], 0, state.mode[k])
+    trial = state._replace(mode=tuple(held))
+    s = model.values(t, y, trial)
+    _, matrix = model.linear(t, y, trial, s)
+    return jnp.stack([on[k] & forks(model, k, s[k], matrix[i, i]) for i, k in dry]).any()
 
 
 def _size(model: Model, k: int, t: Scalar, y: Y, state: State, s: tuple) -> Scalar:

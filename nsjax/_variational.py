@@ -97,8 +97,7 @@ def arcs(sol: Solution, t0: Scalar, y0: Y) -> tuple[Array, Array, Y, Array]:
 
     begin = rows(t0, events.t, sol.t1)
     end = jnp.concatenate([begin[1:], sol.t1[None]])
-    first = jnp.where(events.num > 0, events.mode_before[0], sol.mode1) if capacity else sol.mode1
-    return begin, end, rows(y0, events.y_after, sol.y1), rows(first, events.mode_after, sol.mode1)
+    return begin, end, rows(y0, events.y_after, sol.y1), rows(sol.mode0, events.mode_after, sol.mode1)
 
 
 def monodromy_by_arcs(

@@ -23,6 +23,7 @@ ORDER = (
     "_crossing",
     "_step",
     "_solution",
+    "_sensitivity",
     "_save",
     "_settle",
     "_event",

@@ -44,7 +44,7 @@ def test_section_3_4(classic):
     np.testing.assert_allclose([slip.y_after.x, slip.y_after.v], [2.0, 0.2], atol=1e-10)
     np.testing.assert_allclose(classic.multipliers, [1, 0], atol=1e-10)
     assert classic.stable and classic.result == RESULTS.successful and classic.residual < 1e-10
-    assert classic.itinerary == ({"belt": -1}, {"belt": 0}, {"belt": -1})
+    assert list(classic.itinerary) == [{"belt": -1}, {"belt": 0}, {"belt": -1}]
     assert "stable periodic orbit of StickSlip" in str(classic) and "13.536" in str(classic)
 
 

@@ -1,0 +1,181 @@
+"""Derivatives with the itinerary to which they belong, and solutions that are not the only ones."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import flat, Motion, pid
+from test_grazing import impact, Touch
+
+import nsjax
+from nsjax import gallery, RESULTS, sensitivity, solve
+
+
+LINE = type(gallery.THESIS["(2.3)"].y0)
+PLANE = type(gallery.THESIS["example 2.3"].y0)
+
+
+@jax.jit
+def touch(system):
+    """State at t = 3, without a wall (cos t, -sin t); the wall is touched if `gap` <= 0."""
+
+    def end(system):
+        options = dict(solver=dfx.Dopri8(), stepsize_controller=pid(1e-12), throw=False)
+        sol = solve(system, -np.pi, 3.0, Motion(-1.0, 0.0), **options)
+        return jnp.stack(sol.y1), sol
+
+    return sensitivity(end, system)
+
+
+def test_a_walk_over_a_grazing_is_seen():
+    """Pitfall 21: on one side of it the derivative is that of an impact, on the other there is none."""
+    gaps = (-0.1, -0.01, 0.01, 0.1)
+    found = [touch(Touch(gap)) for gap in gaps]
+    for gap, s in zip(gaps, found):
+        hits = gap < 0
+        want = jax.jacfwd(impact)(gap) if hits else np.zeros(2)
+        np.testing.assert_allclose(s.value, impact(gap) if hits else [np.cos(3), -np.sin(3)], atol=1e-9)
+        np.testing.assert_allclose(s.jacobian.gap, want, rtol=1e-8, atol=1e-9)
+        assert s.defined and s.result == RESULTS.successful
+        assert str(s.itinerary) == ("wall +0 -> wall +0" if hits else "wall +0")
+    same = [[bool(a.itinerary.same_as(b.itinerary)) for a in found] for b in found]
+    np.testing.assert_array_equal(same, np.kron(np.eye(2), np.ones((2, 2))))
+    grazing = touch(Touch(-1e-12))
+    assert not grazing.defined and grazing.result == RESULTS.tangential_event
+
+
+def test_itineraries_of_many():
+    """In a batch, and with logs of different sizes."""
+
+    def path(v, max_events):
+        sol = solve(gallery.StickSlip(v_dr=v), 0.0, 20.0, Motion(2.5, -0.5), max_events=max_events)
+        return sol.itinerary
+
+    v = jnp.asarray([0.3, 0.31, 0.9])
+    few, many = jax.vmap(lambda v: path(v, 16))(v), path(0.3, 32)
+    np.testing.assert_array_equal(few.same_as(many), [True, True, False])
+    assert len(set(map(len, map(list, [many, path(0.9, 32)])))) == 2
+    other = solve(gallery.SlidingPoint(), 0.0, 1.0, LINE(2.0)).itinerary
+    with pytest.raises(ValueError, match="different systems"):
+        other.same_as(many)
+
+
+def test_reverse():
+    """By `reverse=True`, for a scalar of many parameters."""
+
+    def end(p):
+        sol = solve(
+            gallery.StickSlip(v_dr=p["v"], k=p["k"]), 0.0, 9.0, Motion(2.5, -0.5), adjoint=dfx.DirectAdjoint(),
+            solver=dfx.Heun(), stepsize_controller=pid(1e-4),
+        )  # fmt: skip
+        return sol.y1.x, sol
+
+    p = {"v": 0.3, "k": 1.1}
+    forward, backward = sensitivity(end, p), sensitivity(end, p, reverse=True)
+    assert forward.itinerary.same_as(backward.itinerary)
+    np.testing.assert_allclose(jax.tree.leaves(backward.jacobian), jax.tree.leaves(forward.jacobian), rtol=1e-12)
+
+
+# Solutions that are not unique.
+
+
+@pytest.mark.parametrize(
+    "system, t1, y0, mode, unique",
+    [
+        (gallery.SlidingPoint(), 3.0, LINE(2.0), None, True),
+        (gallery.StickingPoint(), 2.0, LINE(-1.0), None, False),  # it crosses, but might stay at x = 0
+        (gallery.StickingPoint(), 2.0, LINE(0.0), 0, False),
+        (gallery.StickingPoint(), 2.0, LINE(0.0), 1, False),
+        (gallery.StickingPoint(), 2.0, LINE(1.0), None, True),
+        (gallery.RepulsionSliding(), 1.0, PLANE(0.0, 1.25), None, True),
+        (gallery.RepulsionSliding(), 1.0, PLANE(0.0, 1.0), 0, False),
+        (gallery.RepulsionSliding(), 1.0, PLANE(0.0, 1.0), -1, False),
+        (gallery.RepulsionSliding(), -1.0, PLANE(0.0, 1.25), None, False),  # backwards it enters repulsion sliding
+        (gallery.AttractionSliding(), 1.0, PLANE(0.0, 1.25), None, True),
+        (gallery.AttractionSliding(), -1.0, PLANE(0.0, 1.0), 0, False),
+    ],
+)
+def test_unique(system, t1, y0, mode, unique):
+    """Section 2.4, examples 2.2 to 2.5: `Solution.unique` tells that `solve` or the user has chosen among several."""
+    sol = solve(system, 0.0, t1, y0, mode=None if mode is None else {"surface": jnp.asarray(mode)})
+    assert sol.unique == unique
+
+
+def test_friction_law_c_as_an_inclusion():
+    """(2.29): at rest under a force between F_slip and F_stick the block may stay or slide; it stays unless told to."""
+    system = gallery.StickSlip()  # (3.33): slides with the force 1, rests up to 2
+
+    def run(x, mode=None):
+        sol = solve(system, 0.0, 1.0, Motion(x, 0.2), mode=None if mode is None else {"belt": jnp.asarray(mode)})
+        return sol.unique, int(sol.mode1[0]), flat(sol.y1)
+
+    unique, mode, y = run(1.5)
+    assert (unique, mode) == (False, 0)
+    np.testing.assert_allclose(y, [1.7, 0.2], atol=1e-14)
+    unique, mode, y = run(1.5, mode=-1)
+    assert (unique, mode) == (False, -1)
+    np.testing.assert_allclose(y, [1 + 0.5 * np.cos(1) + 0.2 * np.sin(1), 0.2 * np.cos(1) - 0.5 * np.sin(1)], atol=1e-8)
+    assert run(0.5)[:2] == (True, 0)
+
+
+def test_repulsion_sliding_does_not_drift():
+    """Pitfall 24: off the surface everything grows without bound at once; on it the solution and its derivative among
+    the solutions that stay are exact."""
+
+    def end(x1):
+        sol = solve(
+            gallery.RepulsionSliding(), 0.0, 100.0, PLANE(x1, jnp.ones_like(x1)), mode={"surface": jnp.asarray(0)}
+        )
+        return flat_jax(sol.y1), sol
+
+    s = sensitivity(end, 0.5)
+    np.testing.assert_allclose(s.value, [0.5 - 500, 1], rtol=1e-13)
+    np.testing.assert_array_equal(s.jacobian, [1, 0])
+    assert list(s.itinerary) == [{"surface": 0}]
+
+
+def flat_jax(y):
+    return jnp.stack(jax.tree.leaves(y))
+
+
+def test_orbits_are_admissible():
+    """Pitfall 22: from a guess on the orbit that the system has without its wall, and which passes through it, an orbit
+    is found that does not; and one with friction slips in friction's direction."""
+
+    class Wall(nsjax.System):
+        omega: float = 0.8
+        gap: float = 1.0
+
+        def vector_field(self, t, y, s):
+            return Motion(y.v, jnp.cos(self.omega * t) - 0.4 * y.v - y.x - s.wall)
+
+        @nsjax.impact
+        def wall(self, t, y):
+            return self.gap - y.x
+
+        @wall.restitution
+        def wall(self):
+            return 0.6
+
+        @property
+        def period(self):
+            return 2 * jnp.pi / self.omega
+
+    response = 1 / (1 - 0.64 + 0.32j)
+    assert abs(response) > 2
+    guess = Motion(response.imag, 0.8 * response.real)  # at a quarter of the period before its top
+    t0 = -np.pi / 1.6
+    orbit = nsjax.find_orbit(Wall(), guess, t0=t0, solver=dfx.Tsit5(), stepsize_controller=pid(1e-11))
+    sol = orbit.solve()
+    t = jnp.linspace(orbit.t0, orbit.t0 + orbit.period, 500)
+    x = jax.vmap(sol)(t).x
+    assert len(sol.events) >= 1 and x.max() > 1 - 1e-3 and x.max() < 1 + 1e-12
+
+    method = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-11))
+    belt = nsjax.find_orbit(gallery.StickSlip(c=0.1), Motion(2.0, 0.0), period=12.635, **method)
+    sol = belt.solve(saveat=dfx.SaveAt(ts=jnp.linspace(0.0, belt.period, 200)))
+    mode, relative = np.asarray(sol.modes[:, 0]), np.asarray(sol.ys.v) - 0.2
+    slip = mode != 0
+    assert slip.any() and np.all((mode * relative)[slip] > 0)
+    assert np.all(np.abs(np.asarray(sol.ys.x) + 0.1 * 0.2)[~slip] <= 2 + 1e-9)
