@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._crossing import bend, first_root
+from ._crossing import bend, deflate, first_root
 from ._filippov import Model, State
 from ._settle import settle
 from ._solution import RESULTS
@@ -91,7 +91,8 @@ def locate(
     field corrects the time, and with it the order of events closer than the dense output can tell. The state follows by
     its Taylor series to second order, so that what remains is of third order in the (small) error of the dense output.
     """
-    found, root = jax.vmap(first_root)(coefficients)
+    known = model.stacked(model.known_roots(state), 0)
+    found, root = jax.vmap(first_root)(deflate(coefficients, known))
     root = jnp.where(found, root, jnp.inf)
     earliest = jnp.min(root)
     args = (model, t, y, f0, state)
@@ -257,12 +258,13 @@ def land(
             lambda a, b, ends=ends: jnp.where(ends, a, b), (te + end.rest, end.y), (t_after, after)
         )
         result = RESULTS.where(fired[k] & end.wrong, RESULTS.wrong_reset, result)
-        fresh = jnp.where(end.stays, jnp.where(end.rise > 0, 1, 2), 0)
+        fresh = jnp.where(end.stays, jnp.where(end.rises, 1, 2), 0)
         roots[k] = jnp.where(fired[k], fresh, roots[k]).astype(jnp.int32)
         if k in model.contacts:
             # Another impact may set a resting contact in motion: it lifts off, or is hit at once.
             level = model.level(k, te, jumped, state_after)
-            moved = (state.mode[k] == 1) & (level != model.level(k, te, before, state_after))
+            (noise,) = model.rounding(lambda t, y, k=k: (model.level(k, t, y, state_after),), te, jumped)
+            moved = (state.mode[k] == 1) & (jnp.abs(level) > 1e3 * noise)
             modes[k] = jnp.where(moved, 0, modes[k])
             roots[k] = jnp.where(moved, (level > 0).astype(jnp.int32), roots[k])
             at[k] = ends | ((state.mode[k] == 1) & ~moved)
@@ -328,7 +330,7 @@ def transversality(model: Model, t: Scalar, y: Y, state: State, slot: Int[Array,
 class Completed(NamedTuple):
     """What an impact leads to: a flight, or with all the flights that would follow it a state of rest."""
 
-    rise: Scalar  # dh/dt after the impact
+    rises: Bool[Array, ""]  # whether dh/dt > 0 after the impact, but for rounding
     flight: Scalar  # how long the next flight lasts
     rest: Scalar  # how long all flights together last
     y: Y  # the state after all of them
@@ -348,10 +350,11 @@ def completed(model: Model, k: int, te: Scalar, before: Y, after: Y, state: Stat
     def rate(t: Scalar, y: Y) -> Scalar:
         return model.approach(k, t, y, state_after)
 
+    one, eps = jnp.ones_like(te), jnp.finfo(te.dtype).eps
     speed = model.approach(k, te, before, state)
     rise = rate(te, after)
     f = model.flow(te, after, state_after)
-    pull = jax.jvp(rate, (te, after), (jnp.ones_like(te), f))[1]
+    pull = jax.jvp(rate, (te, after), (one, f))[1]
     h = jnp.stack(model.h(k, te, after))
     noise = model.rounding(lambda t, y: model.h(k, t, y), te, after)
     slack = 1e4 * noise + 2 * jnp.abs(jnp.stack(model.h(k, te, before)))
@@ -359,6 +362,7 @@ def completed(model: Model, k: int, te: Scalar, before: Y, after: Y, state: Stat
     stays = jnp.abs(h[part]) <= slack[part]
     wrong = jnp.any(h < -slack) | (stays & (rise < -1e-9 * jnp.abs(speed)))
 
+    slow = 64 * eps * (jnp.abs(speed) + model.sizes(lambda t, y: model.h(k, t, y), te, after, one, f)[part])
     ratio = jnp.where(speed == 0, 0, -rise / jnp.where(speed == 0, 1, speed))
     flight = 2 * rise / jnp.where(pull < 0, -pull, 1)
     possible = stays & ~wrong & (pull < 0) & (ratio < 1)
@@ -369,4 +373,4 @@ def completed(model: Model, k: int, te: Scalar, before: Y, after: Y, state: Stat
     scale = jnp.where(gain == 0, 0, left / jnp.where(gain == 0, 1, gain))
     rested = jax.tree.map(lambda x, d: x - scale * d, drift, impulse)
     low = 0.25 * flight * rise <= 1e3 * noise[part]
-    return Completed(rise, flight, rest, rested, possible, low, stays, wrong)
+    return Completed(rise > slow, flight, rest, rested, possible, low, stays, wrong)

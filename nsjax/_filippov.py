@@ -303,8 +303,12 @@ class Model(eqx.Module):
             rows.append(row)
         return rows
 
+    def sizes(self, fn: Any, t: Scalar, y: Y, dt: Scalar, dy: Y) -> Array:
+        """Sums of the absolute values of the terms of d`fn` for changes `dt` and `dy`, whatever they cancel to."""
+        flat, unravel = jfu.ravel_pytree(y)
+        by_t, by_y = jax.jacfwd(lambda t, y: jnp.stack(fn(t, unravel(y))), argnums=(0, 1))(t, flat)
+        return jnp.abs(by_t * dt) + jnp.sum(jnp.abs(by_y * jfu.ravel_pytree(dy)[0]), axis=-1)
+
     def rounding(self, fn: Any, t: Scalar, y: Y) -> Array:
         """What rounding of time and state alone can make of the entries of `fn(t, y)`: below it they count as zero."""
-        flat, unravel = jfu.ravel_pytree(y)
-        dt, dy = jax.jacfwd(lambda t, y: jnp.stack(fn(t, unravel(y))), argnums=(0, 1))(t, flat)
-        return 8 * jnp.finfo(t.dtype).eps * (jnp.abs(dt * t) + jnp.sum(jnp.abs(dy * flat), axis=-1))
+        return 8 * jnp.finfo(t.dtype).eps * self.sizes(fn, t, y, t, y)

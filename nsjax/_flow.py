@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._compact import compact_cond
-from ._crossing import deflate, elevate, nodes, to_bernstein, to_chebyshev
+from ._crossing import elevate, nodes, to_bernstein, to_chebyshev
 from ._event import land, Landing
 from ._filippov import Model, State
 from ._once import once
@@ -118,7 +118,7 @@ class Flow(eqx.Module):
         return out, resolved
 
     def stacked(self, coefficients: list[list[list[Scalar]]]) -> Float[Array, "slots parts coefficients"]:
-        """The same as one array, of one degree, known roots at the start of the step divided out of it."""
+        """The same as one array, of one degree."""
         n = self.stepper.degree if all(self.affine) else self.degree
         dtype = self.t0.dtype
         rows = [
@@ -132,9 +132,7 @@ class Flow(eqx.Module):
 
     def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list) -> Landing:
         """The step once more, to its first event."""
-        coefficients = lax.stop_gradient(coefficients)
-        known = self.model.stacked(self.model.known_roots(state), 0)
-        polynomials = deflate(self.stacked(coefficients), known)
+        polynomials = self.stacked(lax.stop_gradient(coefficients))
         return land(self.model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials)
 
     def attempt(self, c: Carry) -> _Attempt:

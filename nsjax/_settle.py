@@ -14,7 +14,7 @@ from ._system import frozen
 from ._types import Scalar, Y
 
 
-_TRIED = 3  # so many switches at their surfaces are settled by trying every assignment
+_TRIED = 4  # so many switches at their surfaces are settled by trying every assignment
 
 
 def settle(
@@ -27,7 +27,7 @@ def settle(
 ) -> tuple[State, Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
     """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}, every contact one from {1, 0}.
 
-    All of them hold if that is valid (|λ| <= b, a contact force λ >= 0), else as many as can be. Of up to three
+    All of them hold if that is valid (|λ| <= b, a contact force λ >= 0), else as many as can be. Of up to four
     switches every assignment is tried; if two are equally good the solution is not unique. Of more, the one that
     violates its law most is released, to the sign of its λ, and a released switch whose motion then opposes this is
     taken back, until nothing is violated.
@@ -116,7 +116,7 @@ def settle(
 
     _, rates, slopes = look(trial)
     if model.contacts and len(model.holdable) > 1:
-        trial = _pinned(model, t, y, state, at, trial, rates)
+        trial = _pinned(model, t, y, state, at, leaves, trial, rates)
     roots = list(state.roots)
     unsure = false
     for k in which:
@@ -200,8 +200,9 @@ def _best(
     return trial | out, jnp.sum(score == score[best]) != 1
 
 
-def _pinned(model: Model, t: Scalar, y: Y, state: State, at: dict, trial: dict, rates: dict) -> dict:
-    """A `sgn` switch at its surface that a contact keeps there, whatever its own value, is neither side's."""
+def _pinned(model: Model, t: Scalar, y: Y, state: State, at: dict, leaves: dict, trial: dict, rates: dict) -> dict:
+    """A `sgn` switch at its surface that a contact keeps there, whatever its own value, is neither side's. (One that
+    has just reached its bound has dh/dt = 0 too.)"""
     held = state._replace(mode=tuple(trial.values()))
     s = model.values(t, y, held)
     _, matrix = model.linear(t, y, held, s)
@@ -214,7 +215,7 @@ def _pinned(model: Model, t: Scalar, y: Y, state: State, at: dict, trial: dict, 
             for j, c in enumerate(model.holdable)
             if c in model.contacts
         )
-        pinned = at[k] & (pull > 0) & (jnp.abs(rates[k]) <= 1e-10 * pull)
+        pinned = at[k] & (leaves[k] == 0) & (pull > 0) & (jnp.abs(rates[k]) <= 1e-10 * pull)
         out[k] = jnp.where(pinned, 0, trial[k]).astype(jnp.int32)
     return out
 

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
@@ -73,12 +72,13 @@ def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[St
     result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
     # Guards of surfaces on which the start lies have a root there already.
     roots = list(state.roots)
-    s = model.values(t, y, state)
+    f = model.flow(t, y, state)
     for k, here in on.items():
         rate = model.approach(k, t, y, state)
         sign = 1 - state.mode[k] if isinstance(model.switches[k], impact) else state.mode[k]
-        scale = jnp.sqrt(jnp.finfo(t.dtype).eps) * _size(model, k, t, y, state, s)
-        fresh = jnp.where(jnp.abs(rate) > scale, 1, 2)
+        part = 0 if state.part[k] is None else state.part[k]
+        size = model.sizes(lambda t, y, k=k: model.h(k, t, y), t, y, jnp.ones_like(t), f)[part]
+        fresh = jnp.where(jnp.abs(rate) > jnp.sqrt(jnp.finfo(t.dtype).eps) * size, 1, 2)
         settled = at.get(k, jnp.zeros((), bool))
         roots[k] = jnp.where(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
     return state._replace(roots=tuple(roots)), forked, result
@@ -96,17 +96,3 @@ def _forked(model: Model, t: Scalar, y: Y, state: State, on: dict[int, Bool[Arra
     s = model.values(t, y, trial)
     _, matrix = model.linear(t, y, trial, s)
     return jnp.stack([on[k] & forks(model, k, s[k], matrix[i, i]) for i, k in dry]).any()
-
-
-def _size(model: Model, k: int, t: Scalar, y: Y, state: State, s: tuple) -> Scalar:
-    """The largest that dh/dt could be for the components of the field: what its rounding is measured by."""
-    f = model.field(t, y, s)
-    total = jnp.zeros((), t.dtype)
-    for i in range(len(jax.tree.leaves(f))):
-        only = jax.tree.unflatten(
-            jax.tree.structure(f),
-            [x if i == j else jnp.zeros_like(x) for j, x in enumerate(jax.tree.leaves(f))],
-        )
-        part = jax.jvp(lambda y: jnp.min(jnp.stack(model.h(k, t, y))), (y,), (only,))[1]
-        total = total + jnp.abs(part)
-    return total

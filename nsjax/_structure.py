@@ -7,28 +7,71 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.extend.core as jex
 import jax.numpy as jnp
-from jax.interpreters import partial_eval as pe
+import numpy as np
 
 
-def depends(fn: Callable[..., Any], args: tuple[Any, ...], on: int) -> bool:
-    """Whether any output of `fn(*args)` uses any leaf of `args[on]`, after dead code is removed."""
-    closed = jax.make_jaxpr(fn)(*args)
-    _, used = pe.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
-    sizes = [len(jax.tree.leaves(a)) for a in args]
-    start = sum(sizes[:on])
-    return any(used[start : start + sizes[on]])
+# Each entry of the result depends on the same entry of the operands.
+_ELEMENTWISE = frozenset(
+    "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy cos cosh "
+    "div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le lgamma digamma log log1p logistic lt "
+    "max min mul ne neg nextafter not or pow real_type reduce_precision rem round rsqrt select_n sign sin sinh sqrt "
+    "square stop_gradient sub tan tanh xor".split()
+)
+# Entries are moved, repeated or summed: what that makes of a mask (parameters `p` of the primitive, operands `m`).
+_MOVING: dict[str, Callable[..., np.ndarray]] = {
+    "broadcast_in_dim": lambda p, m: np.broadcast_to(
+        np.expand_dims(m, tuple(i for i in range(len(p["shape"])) if i not in p["broadcast_dimensions"])), p["shape"]
+    ),
+    "concatenate": lambda p, *ms: np.concatenate(ms, p["dimension"]),
+    "reduce_sum": lambda p, m: m.any(p["axes"]),
+    "reshape": lambda p, m: m.reshape(p["new_sizes"]),
+    "rev": lambda p, m: np.flip(m, p["dimensions"]),
+    "slice": lambda p, m: m[tuple(map(slice, p["start_indices"], p["limit_indices"], p["strides"] or [1] * m.ndim))],
+    "squeeze": lambda p, m: m.squeeze(p["dimensions"]),
+    "stack": lambda p, *ms: np.stack(ms, p["axis"]),
+    "transpose": lambda p, m: m.transpose(p["permutation"]),
+}
+
+
+def _masks(jaxpr: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Which entries of the results depend on the marked entries of the inputs; too many rather than too few."""
+    known = dict(zip(jaxpr.invars, inputs))
+
+    def shape(v: Any) -> tuple[int, ...]:
+        return getattr(v.aval, "shape", ())
+
+    def read(v: Any) -> np.ndarray:
+        return known[v] if not isinstance(v, jex.Literal) and v in known else np.zeros(shape(v), bool)
+
+    for e in jaxpr.eqns:
+        have, name = [read(v) for v in e.invars], e.primitive.name
+        inner = [p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr)]
+        if not any(m.any() for m in have):
+            out = [np.zeros(shape(v), bool) for v in e.outvars]
+        elif name in _ELEMENTWISE:
+            out = [np.any(np.broadcast_arrays(*have), axis=0)]
+        elif name in _MOVING:
+            out = [_MOVING[name](e.params, *have)]
+        elif name == "dot_general" and not e.params["dimension_numbers"][1][0]:
+            left, right = (m.any(tuple(axes)) for m, axes in zip(have, e.params["dimension_numbers"][0]))
+            out = [np.logical_or.outer(left, right)]
+        elif name in ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call") and len(inner) == 1:
+            out = _masks(inner[0].jaxpr, have)
+        else:
+            out = [np.ones(shape(v), bool) for v in e.outvars]
+        known.update(zip(e.outvars, out))
+    return [read(v) for v in jaxpr.outvars]
+
+
+def is_constant(fn: Callable[[Any], Any], x: Any) -> bool:
+    """Whether `fn` is structurally independent of `x`, entry by entry: a state may be one array or several leaves."""
+    jaxpr = jax.make_jaxpr(fn)(x).jaxpr
+    return not any(m.any() for m in _masks(jaxpr, [np.ones(v.aval.shape, bool) for v in jaxpr.invars]))
 
 
 def is_affine(fn: Callable[[Any], Any], x: Any) -> bool:
     """Whether `fn` is structurally affine in `x`: its derivative does not depend on where it is taken."""
-
-    def tangent(x: Any, dx: Any) -> Any:
-        return jax.jvp(fn, (x,), (dx,))[1]
-
-    return not depends(tangent, (x, jax.tree.map(jnp.ones_like, x)), 0)
-
-
-def is_constant(fn: Callable[[Any], Any], x: Any) -> bool:
-    """Whether `fn` is structurally independent of `x`."""
-    return not depends(fn, (x,), 0)
+    dx = jax.tree.map(jnp.ones_like, x)
+    return is_constant(lambda x: jax.jvp(fn, (x,), (dx,))[1], x)

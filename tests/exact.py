@@ -25,10 +25,15 @@ class Shape(NamedTuple):
     impact: int
     forced: bool  # whether the field depends on time
     moving: bool  # whether the surfaces do
+    rest: bool = False  # whether most impacts are plastic, so that they lead to rest at once
 
     @property
     def switches(self) -> int:
         return self.sgn + self.relay + self.impact
+
+    @property
+    def positions(self) -> int:
+        return self.n // 2 if self.impact else 0
 
 
 class Case(NamedTuple):
@@ -72,7 +77,7 @@ def generate(rng: np.random.Generator, shape: Shape) -> Case:
     n, (m, r, c) = shape.n, shape[1:4]
     width = n + 3
     F, D, G = np.zeros((n, width)), np.zeros((n, m + r + c)), np.zeros((m + r + c, width))
-    pairs = n // 2 if c else 0
+    pairs = shape.positions
     free = slice(pairs, n)  # equations of motion are second order: what acts, acts on velocities
     A = rng.normal(size=(n, n)) * rng.choice([0.3, 1.0]) / np.sqrt(n) - rng.uniform(0.1, 1) * np.eye(n)
     if pairs:
@@ -111,15 +116,14 @@ def generate(rng: np.random.Generator, shape: Shape) -> Case:
         if shape.moving:
             G[k, n + 1 :] = 0.15 * rng.normal(size=2)
         D[pairs : 2 * pairs, k] = normal * weight
+    e = rng.uniform(0.3, 0.9, c) * (rng.random(c) < 0.2 if shape.rest else 1)
     y0 = rng.normal(size=n)
     if pairs:
         y0[:pairs] *= 0.1
         for k in range(m + r, m + r + c):  # inside, with room
             G[k, n] = max(G[k, n], 0.1 - G[k] @ np.concatenate([y0, [0, 1, 0]]))
     bound = np.where((rng.random(m) < 0.5) & (np.sum(G[:m, :n].T * D[:, :m], 0) < 0), rng.uniform(1.05, 2, m), 1.0)
-    return Case(
-        F, D, G, off, bound, rng.uniform(0.3, 0.9, c), np.array(rng.uniform(0.5, 4)), y0, np.array(rng.uniform(3, 8))
-    )
+    return Case(F, D, G, off, bound, e, np.array(rng.uniform(0.5, 4)), y0, np.array(rng.uniform(3, 8)))
 
 
 # Nodes of the first look at a polynomial on [0, 1], and the half width of the interval that each stands for.
@@ -170,7 +174,7 @@ class _Field(NamedTuple):
     """One mode: z' = M z, the guards that watch it, and what is needed to look for their roots."""
 
     M: np.ndarray
-    L: np.ndarray  # multipliers: rows of the sliding switches, zero for the others
+    L: np.ndarray  # multipliers: rows of the switches that hold, zero for the others
     guards: tuple[tuple[int, int], ...]  # (switch, sign of the bound of λ or 0 for its surface)
     rows: np.ndarray
     h: float
@@ -190,25 +194,30 @@ class _Exact:
         self.base[-2, -1], self.base[-1, -2] = -case.omega, case.omega
         self.D = np.zeros((self.size, shape.switches))
         self.D[: shape.n] = case.D
+        # What a multiplier keeps constant: h of a sliding switch, dh/dt of a contact (nothing but velocities).
+        self.level = np.stack([g @ self.base if kind == "impact" else g for kind, g in zip(self.kinds, case.G)])
         self.fields: dict[tuple, _Field] = {}
         self.laws: dict[tuple, tuple] = {}
 
     def law(self, mode: tuple) -> tuple[np.ndarray, np.ndarray]:
-        """M and the rows of the multipliers, from n_i . (F z + Σ s d + Σ λ d) = 0 for those that slide."""
+        """M and the rows of the multipliers, from n_i . (F z + Σ s d + Σ λ d) = 0 for those that slide or rest."""
         if mode in self.laws:
             return self.laws[mode]
         M, L = self.base.copy(), np.zeros((len(mode), self.size))
         values = [0 if kind == "impact" else s for kind, s in zip(self.kinds, mode)]
         M[:, self.shape.n] += self.D @ np.array(values, float)
-        slides = [k for k, kind in enumerate(self.kinds) if kind == "sgn" and mode[k] == 0]
-        if slides:
-            matrix = self.case.G[slides] @ self.D[:, slides]
+        holds = [k for k in range(len(mode)) if self.holds(k, mode)]
+        if holds:
+            matrix = self.level[holds] @ self.D[:, holds]
             if np.linalg.cond(matrix) > 1e4:
                 raise Sensitive("singular")
-            L[slides] = np.linalg.solve(matrix, -self.case.G[slides] @ M)
+            L[holds] = np.linalg.solve(matrix, -self.level[holds] @ M)
             M = M + self.D @ L
         self.laws[mode] = M, L
         return M, L
+
+    def holds(self, k: int, mode: tuple | list) -> bool:
+        return mode[k] == {"sgn": 0, "relay": None, "impact": 1}[self.kinds[k]]
 
     def field(self, mode: tuple) -> _Field:
         if mode in self.fields:
@@ -222,6 +231,10 @@ class _Exact:
                     row[self.shape.n] += self.case.bound[k]
                     guards.append((k, sign))
                     rows.append(row)
+                continue
+            if kind == "impact" and mode[k]:
+                guards.append((k, 1))
+                rows.append(L[k])
                 continue
             guards.append((k, 0))
             if kind == "sgn":
@@ -244,6 +257,9 @@ class _Exact:
         at = sorted(at)
         options = []
         for k in at:
+            if self.kinds[k] == "impact":
+                options.append((0,) if k in leaves else (1, 0))
+                continue
             attracts = self.case.G[k] @ self.D[:, k] < 0
             options.append((leaves[k],) if k in leaves else (0, 1, -1) if attracts else (1, -1))
         for choice in itertools.product(*options):
@@ -253,7 +269,10 @@ class _Exact:
             M, L = self.law(tuple(trial))
             slack = []
             for k, s in zip(at, choice):
-                if s == 0:
+                if self.kinds[k] == "impact":
+                    if k not in leaves:  # it pushes, or h'' > 0
+                        slack.append(L[k] @ z if s else self.level[k] @ M @ z)
+                elif s == 0:
                     slack.append(1 - abs(L[k] @ z) / self.case.bound[k])
                 elif k not in leaves or self.case.bound[k] > 1:  # else dh/dt = 0 at this instant
                     slack.append(s * (self.case.G[k] @ M @ z))
@@ -265,7 +284,7 @@ class _Exact:
         if not valid:
             raise Unsolvable
         # With b > 1 stick and slip may both be possible; then it sticks.
-        stuck = [sum(v[k] == 0 for k in at) for v in valid]
+        stuck = [sum(self.holds(k, v) for k in at) for v in valid]
         best = [v for v, s in zip(valid, stuck) if s == max(stuck)]
         if len(best) > 1:
             raise Sensitive("not unique")
@@ -313,14 +332,15 @@ class _Exact:
     def jump(self, z: np.ndarray, mode: list, k: int, at: set[int]) -> tuple[np.ndarray, list[int]]:
         """Newton's law at impact k, h'(t+) = -e h'(t-), as a matrix, and the relays that it switches; `mode` and `at`
         are brought up to date."""
-        rate = self.case.G[k] @ self.base  # h' = rate . z: nothing but velocities
-        push = self.D[:, k]
+        rate, push = self.level[k], self.D[:, k]
         R = np.eye(self.size) - (1 + self.case.e[k - self.shape.sgn - self.shape.relay]) * np.outer(push, rate) / (
             rate @ push
         )
         after = R @ z
         toggled = []
         for j, kind in enumerate(self.kinds):
+            if kind == "impact" and mode[j] == 1 and self.level[j] @ push != 0:
+                raise Sensitive("impact on what rests")
             if kind == "sgn" and self.case.G[j] @ push != 0:
                 h = self.case.G[j] @ after
                 if abs(h) < 1e-6:
@@ -363,7 +383,7 @@ class _Exact:
             flow = expm(field.M * length)
             z, growth, t = flow @ z, flow @ growth, t + length
             row, before = field.rows[field.guards.index((k, sign))], field.M @ z
-            at = {j for j, kind in enumerate(self.kinds) if kind == "sgn" and mode[j] == 0}
+            at = {j for j in range(len(mode)) if self.holds(j, mode)}
             leaves, R, toggled, new = {}, np.eye(self.size), [], list(mode)
             gains.append(np.sum(np.linalg.norm(row @ growth, axis=-1)) / abs(row @ before))
             try:
@@ -372,7 +392,7 @@ class _Exact:
                 if len(times) >= max_events:
                     raise Sensitive("many events")
                 if sign:
-                    leaves[k] = sign
+                    leaves[k] = sign  # (what rests leaves whatever that is)
                 elif self.kinds[k] == "sgn":
                     at.add(k)
                 elif self.kinds[k] == "relay":
@@ -382,6 +402,8 @@ class _Exact:
                         raise Sensitive("accumulation")
                     last_hit[k] = t
                     R, toggled = self.jump(z, new, k, at)
+                    if self.case.e[k - self.shape.sgn - self.shape.relay] == 0:
+                        at.add(k)
                 after = self.settle(R @ z, tuple(new), at, leaves)
             except Sensitive as problem:
                 raise Sensitive(problem.args[0], t) from None
@@ -389,8 +411,10 @@ class _Exact:
                 times, switches, modes = [*times, t], [*switches, k], [*modes, mode]
                 ends = "no mode"
                 break
-            known = {(j, 0): 1 for j in at if after[j] != 0} | ({(k, 0): 1} if self.kinds[k] == "impact" else {})
-            if sign and self.case.bound[k] == 1:
+            known = {(j, 0): 1 for j in at if self.kinds[j] == "sgn" and after[j] != 0}
+            if self.kinds[k] == "impact":
+                known[k, 0] = 3 if sign else 2 if k in at else 1
+            elif sign and self.case.bound[k] == 1:
                 known[k, 0] = 2
             S = R + np.outer(self.law(after)[0] @ R @ z - R @ before, row) / (row @ before)
             z, mode = R @ z, after

@@ -39,6 +39,32 @@ def test_ball_comes_to_rest():
     np.testing.assert_allclose(derivative, jax.grad(accumulation, argnums=(0, 1, 2))(*parameters), rtol=1e-8)
 
 
+class Flat(nsjax.System):
+    """The same ball with its state in one array, and its equation of motion in matrices."""
+
+    inverse: Array  # of the mass matrix
+    e: float = 0.8
+
+    def vector_field(self, t, y, s):
+        force = jnp.stack([-9.81 * 2 + s.floor])
+        return jnp.concatenate([y[1:], self.inverse @ force])
+
+    @nsjax.impact
+    def floor(self, t, y):
+        return y[0]
+
+    @floor.restitution
+    def floor(self):
+        return self.e
+
+
+def test_state_in_one_array():
+    """That dh/dt is no function of the contact force is seen entry by entry."""
+    sol = solve(Flat(jnp.eye(1) / 2), 0.0, 5.0, jnp.array([1.0, 0.0]))
+    assert sol.result == RESULTS.successful and sol.mode1 == 1
+    np.testing.assert_allclose(last_event(sol), accumulation(0.8, 9.81, 1.0), rtol=1e-10)
+
+
 def test_ball_that_hardly_loses_speed():
     """Pitfall 16: eleven thousand impacts before the rest."""
     sol = solve(Ball(e=0.999), 0.0, 1000.0, Motion(1.0, 0.0), max_steps=40_000, max_events=12_000, solver=dfx.Dopri8())

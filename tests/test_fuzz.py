@@ -25,6 +25,7 @@ SHAPES = {
     "relays": (Shape(3, 2, 1, 0, forced=False, moving=False), dfx.Dopri8()),
     "bounce": (Shape(2, 0, 1, 1, forced=True, moving=True), dfx.Tsit5()),
     "walls": (Shape(4, 1, 1, 2, forced=True, moving=False), dfx.Tsit5()),
+    "rest": (Shape(4, 1, 0, 2, forced=True, moving=True, rest=True), dfx.Tsit5()),
     "all": (Shape(6, 3, 2, 1, forced=False, moving=False), dfx.Tsit5()),
 }
 MAX_EVENTS = 40
@@ -48,12 +49,17 @@ class Affine(nsjax.System):
         return jnp.concatenate([y, jnp.ones(1), *[x[None] for x in ticks]])
 
     def vector_field(self, t, y, s):
-        z = self.extended(t, y, self.shape.forced)
-        return self.F[:, : len(z)] @ z + self.D @ jnp.stack([s[k.name] for k in self.switches])
+        z, n = self.extended(t, y, self.shape.forced), self.shape.positions
+        force = self.F[n:, : len(z)] @ z + self.D[n:] @ jnp.stack([s[k.name] for k in self.switches])
+        return jnp.concatenate([y[n : 2 * n], force])
 
     def surface(self, row, t, y):
         z = self.extended(t, y, self.shape.moving)
         return row[: len(z)] @ z
+
+    def gap(self, row, t, y):
+        z, n = self.extended(t, y, self.shape.moving), self.shape.positions
+        return row[:n] @ z[:n] + row[self.shape.n : len(z)] @ z[self.shape.n :]
 
     @property
     def switches(self):
@@ -72,7 +78,7 @@ def _switches(shape: Shape) -> tuple[Any, ...]:
         out.append(switch.off(lambda self, t, y, i=i: self.surface(self.off[i], t, y)))
     for i in range(shape.impact):
         k = len(out)
-        switch = nsjax.impact(lambda self, t, y, k=k: self.surface(self.G[k], t, y), name=f"c{i}")
+        switch = nsjax.impact(lambda self, t, y, k=k: self.gap(self.G[k], t, y), name=f"c{i}")
         out.append(switch.restitution(lambda self, i=i: self.e[i]))
     return tuple(out)
 

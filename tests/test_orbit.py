@@ -71,6 +71,11 @@ def test_sections_3_4_and_6_7(classic, c):
     np.testing.assert_allclose(orbit.monodromy, reference.floats(exact.fundamental), atol=1e-9)
     if c:
         np.testing.assert_allclose(by_autodiff(orbit, gallery.StickSlip(c=c)), orbit.monodromy, atol=1e-8)
+        # Pitfall 22: it slips in friction's direction, and sticks only as far as friction can hold.
+        sol = orbit.solve(saveat=dfx.SaveAt(ts=jnp.linspace(0.0, orbit.period, 200)))
+        mode, x, v = map(np.asarray, (sol.modes[:, 0], sol.ys.x, sol.ys.v))
+        assert set(mode) == {-1, 0} and np.all(v[mode == -1] <= 0.2)
+        assert np.all(np.abs(x + c * v)[mode == 0] <= 2 + 1e-9)
 
 
 def test_section_2_4():
@@ -139,6 +144,39 @@ def test_not_the_orbit_asked_for(parameters, y0, period, result):
     assert orbit.result == result
     with pytest.raises(eqx.EquinoxRuntimeError, match=str(RESULTS[result])[:30]):
         find_orbit(system, Motion(*y0), period=period, **METHOD)
+
+
+class Wall(nsjax.System):
+    """x'' + c x' + x = cos ωt, x <= gap with restitution 0.6."""
+
+    omega: float = 0.8
+    c: float = 0.4
+    gap: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, jnp.cos(self.omega * t) - self.c * y.v - y.x - s.wall)
+
+    @nsjax.impact
+    def wall(self, t, y):
+        return self.gap - y.x
+
+    @wall.restitution
+    def wall(self):
+        return 0.6
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+def test_an_orbit_does_not_pass_through_a_wall():
+    """Pitfall 22: the guess is on the orbit that the system has without its wall."""
+    free = 1 / (1 - 0.8**2 + 0.4 * 0.8j)
+    assert abs(free) > 2
+    # A quarter of the period before cos ωt = 1.
+    orbit = find_orbit(Wall(), Motion(free.imag, 0.8 * free.real), t0=-np.pi / 1.6, **METHOD)
+    sol = orbit.solve(saveat=dfx.SaveAt(ts=jnp.linspace(orbit.t0, orbit.t0 + orbit.period, 500)))
+    assert len(sol.events) >= 1 and 1 - 1e-3 < sol.ys.x.max() < 1 + 1e-12
 
 
 class Hopf(nsjax.System):

@@ -8,7 +8,6 @@ import pytest
 from models import flat, Motion, pid
 from test_grazing import impact, Touch
 
-import nsjax
 from nsjax import gallery, RESULTS, sensitivity, solve
 
 
@@ -137,45 +136,3 @@ def test_repulsion_sliding_does_not_drift():
 
 def flat_jax(y):
     return jnp.stack(jax.tree.leaves(y))
-
-
-def test_orbits_are_admissible():
-    """Pitfall 22: from a guess on the orbit that the system has without its wall, and which passes through it, an orbit
-    is found that does not; and one with friction slips in friction's direction."""
-
-    class Wall(nsjax.System):
-        omega: float = 0.8
-        gap: float = 1.0
-
-        def vector_field(self, t, y, s):
-            return Motion(y.v, jnp.cos(self.omega * t) - 0.4 * y.v - y.x - s.wall)
-
-        @nsjax.impact
-        def wall(self, t, y):
-            return self.gap - y.x
-
-        @wall.restitution
-        def wall(self):
-            return 0.6
-
-        @property
-        def period(self):
-            return 2 * jnp.pi / self.omega
-
-    response = 1 / (1 - 0.64 + 0.32j)
-    assert abs(response) > 2
-    guess = Motion(response.imag, 0.8 * response.real)  # at a quarter of the period before its top
-    t0 = -np.pi / 1.6
-    orbit = nsjax.find_orbit(Wall(), guess, t0=t0, solver=dfx.Tsit5(), stepsize_controller=pid(1e-11))
-    sol = orbit.solve()
-    t = jnp.linspace(orbit.t0, orbit.t0 + orbit.period, 500)
-    x = jax.vmap(sol)(t).x
-    assert len(sol.events) >= 1 and x.max() > 1 - 1e-3 and x.max() < 1 + 1e-12
-
-    method = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-11))
-    belt = nsjax.find_orbit(gallery.StickSlip(c=0.1), Motion(2.0, 0.0), period=12.635, **method)
-    sol = belt.solve(saveat=dfx.SaveAt(ts=jnp.linspace(0.0, belt.period, 200)))
-    mode, relative = np.asarray(sol.modes[:, 0]), np.asarray(sol.ys.v) - 0.2
-    slip = mode != 0
-    assert slip.any() and np.all((mode * relative)[slip] > 0)
-    assert np.all(np.abs(np.asarray(sol.ys.x) + 0.1 * 0.2)[~slip] <= 2 + 1e-9)

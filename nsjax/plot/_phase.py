@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._solution import Solution
-from .._structure import depends
+from .._structure import is_constant
 from .._system import AbstractSwitch, impact, relay, sgn
 from .._types import Y
 from ._path import arcs, chosen, components, solved
@@ -90,7 +90,7 @@ def _draw_surfaces(ax: "Axes", sol: Solution, x: str, y: str) -> None:
     drawn = np.concatenate([np.asarray(line.get_xydata())[::4] for line in ax.get_lines()])
     for switch in sol.system.switches:
         for guard, style in _guards(switch):
-            if depends(lambda t, y, g=guard: g(sol.system, t, y), (sol.t0, sol.y1), 0):
+            if not is_constant(lambda t, g=guard: g(sol.system, t, sol.y1), sol.t0):
                 continue
             h = jax.vmap(lambda point, g=guard: g(sol.system, sol.t0, unravel(point)))(plane)
             h = np.asarray(h).reshape(GRID, GRID)
