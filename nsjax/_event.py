@@ -236,10 +236,10 @@ def land(
             here = ((state.mode[k] == 0) | fired[k] | (halted & (roots[k] > 0))) & ~tip[k]
             roots[k] = jnp.where(tip[k], 1, roots[k])
             if any(isinstance(other, impact) for other in model.switches):
-                # A reset may carry the state across the surface, or off it: the switch follows at once.
+                # An impact may carry the state across the surface, or off it: the switch follows at once.
                 h0 = jnp.min(jnp.stack(model.h(k, te, before)))
                 h1 = jnp.min(jnp.stack(model.h(k, te, after)))
-                moved = h0 != h1
+                moved = jnp.abs(h1 - h0) > jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), te, before))
                 modes[k] = jnp.where(moved, jnp.sign(h1).astype(jnp.int32), modes[k])
                 roots[k] = jnp.where(moved, 0, roots[k])
                 here = (here & ~moved) | (moved & (h1 == 0))
@@ -285,14 +285,16 @@ def land(
         after = model.project(t_after, after, state_after)
 
     roots = list(state_after.roots)
-    guards = model.guards(te, after, state_after) if any(isinstance(s, relay) for s in model.switches) else None
     for k, switch in enumerate(model.switches):
         if isinstance(switch, relay):
             # Its new surface may be the one just crossed (no hysteresis): then its root here is known.
-            assert guards is not None
-            first = next(i for i, s in enumerate(model.slots) if s.switch == k)
-            noise = model.rounding(lambda t, y, first=first: (model.guards(t, y, state_after)[first][0],), te, after)[0]
-            roots[k] = jnp.where(fired[k], (jnp.abs(guards[first][0]) <= noise).astype(jnp.int32), roots[k])
+            own = tuple(s.switch == k for s in model.slots)
+
+            def guard(t: Scalar, y: Y, own: tuple[bool, ...] = own) -> list[Scalar]:
+                return model.guards(t, y, state_after, own)[own.index(True)]
+
+            on_it = jnp.abs(guard(te, after)[0]) <= model.rounding(guard, te, after)[0]
+            roots[k] = jnp.where(fired[k], on_it.astype(jnp.int32), roots[k])
     state_after = state_after._replace(roots=tuple(roots))
     news = jnp.zeros((), bool)
     for k, switch in enumerate(model.switches):

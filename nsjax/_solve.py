@@ -71,10 +71,12 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     state, forked, result = start_mode(model, start, y0, given)
     f0 = model.flow(start, y0, state)
 
-    def guard(i: int, ty: tuple[Scalar, Y]) -> list[Scalar]:
-        return model.guards(ty[0], ty[1], state)[i]
+    slots = range(len(model.slots))
 
-    affine = tuple(is_affine(ft.partial(guard, i), (start, y0)) for i in range(len(model.slots)))
+    def guard(i: int, ty: tuple[Scalar, Y]) -> list[Scalar]:
+        return model.guards(*ty, state, wanted=tuple(j == i for j in slots))[i]
+
+    affine = tuple(is_affine(ft.partial(guard, i), (start, y0)) for i in slots)
     terms = dfx.ODETerm(lambda t, y, args: model.flow(t, y, state))
     func: Any = solver.func
     first, controller_state = controller.init(terms, start, stop, y0, dt0, None, func, solver.error_order(terms))
@@ -123,7 +125,8 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         saved=saved,
         meter=meter.init(),
     )
-    dynamic, static = eqx.partition(jax.tree.map(_strong, carry), eqx.is_array)
+    carry = _tied(jax.tree.map(_strong, carry), (system, t0, t1, y0))
+    dynamic, static = eqx.partition(carry, eqx.is_array)
 
     def body(dynamic: Any) -> Any:
         new = eqx.filter(flow.body(eqx.combine(dynamic, static)), eqx.is_array)
@@ -169,6 +172,24 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
 
 def _strong(x: Any) -> Any:
     return jnp.asarray(x) if isinstance(x, (bool, int, float)) else x
+
+
+def _tied(carry: Carry, args: Any) -> Carry:
+    """The same, but all of it depends on `args`, formally. What is differentiated or batched in the loop is so from its
+    start, and need not be found out by transforming the body once more for every level at which it spreads."""
+    never = jnp.zeros((), bool)
+    nought = sum(jnp.sum(jnp.where(never, x, 0)) for x in jax.tree.leaves(eqx.filter(args, eqx.is_inexact_array)))
+
+    def tie(x: Any) -> Any:
+        if not eqx.is_array(x):
+            return x
+        return x | (nought != 0) if x.dtype == bool else x + jnp.asarray(nought).astype(x.dtype)
+
+    # The requested times stay the same in every lane, and the progress meter belongs to all of them.
+    def apart(c: Carry) -> tuple:
+        return c.saved.request, c.meter
+
+    return eqx.tree_at(apart, jax.tree.map(tie, carry), apart(carry), is_leaf=lambda x: x is None)
 
 
 def _row(mode: tuple) -> Int[Array, " switches"]:

@@ -176,9 +176,9 @@ def told_but_ambiguous(tally: collections.Counter) -> int:
     return tally["needlessly told"] - tally["needlessly told ambiguous"]
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", ["friction", "corners", "relays", "rest"])
 def test_random_systems(name):
-    tally, wrong = fuzz(name, 60, 0, derive=name in ("friction", "bounce"))
+    tally, wrong = fuzz(name, 80, 0, derive=name == "friction")
     assert not wrong
     assert share(tally, "sensitive") <= 0.02
     assert told_but_ambiguous(tally) == 0 and share(tally, "needlessly told") <= 0.1

