@@ -38,7 +38,7 @@ def test_reverse_is_forward(forward, adjoint):
     np.testing.assert_allclose(backward, forward, rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize("adjoint", ADJOINTS)
+@pytest.mark.parametrize("adjoint", ["jacobian", pytest.param("checkpoint", marks=pytest.mark.slow)])
 def test_lanes(forward, adjoint):
     """Pitfall 18: under `vmap` the event's branch is run by lanes that have no event."""
     points = POINT + jnp.arange(3.0)[:, None] * jnp.array([0.0, 0.01, 0.0, 0.1, 0.0])

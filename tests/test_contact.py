@@ -205,6 +205,7 @@ def test_friction_by_the_contact_force():
     np.testing.assert_allclose(slow.y1.x, np.sqrt(2 * z / p.g), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_fundamental_matrix_through_rest():
     """Two routes, while it slides at rest and after it sticks."""
     y0, ts = Thrown(0.0, 0.5, 5.0, 0.0), jnp.array([1.2, 5.0])

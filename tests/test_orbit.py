@@ -169,6 +169,7 @@ class Wall(nsjax.System):
         return 2 * jnp.pi / self.omega
 
 
+@pytest.mark.slow
 def test_an_orbit_does_not_pass_through_a_wall():
     """Pitfall 22: the guess is on the orbit that the system has without its wall."""
     free = 1 / (1 - 0.8**2 + 0.4 * 0.8j)
