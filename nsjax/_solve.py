@@ -178,7 +178,8 @@ def _tied(carry: Carry, args: Any) -> Carry:
     """The same, but all of it depends on `args`, formally. What is differentiated or batched in the loop is so from its
     start, and need not be found out by transforming the body once more for every level at which it spreads."""
     never = jnp.zeros((), bool)
-    nought = sum(jnp.sum(jnp.where(never, x, 0)) for x in jax.tree.leaves(eqx.filter(args, eqx.is_inexact_array)))
+    leaves = jax.tree.leaves(eqx.filter(args, eqx.is_inexact_array))
+    nought = sum(jnp.sum(jnp.where(never, jnp.real(x), 0)).astype(carry.t.dtype) for x in leaves)
 
     def tie(x: Any) -> Any:
         if not eqx.is_array(x):
