@@ -51,7 +51,7 @@ class Racket(nsjax.System):
 
 
 class Ceiling(nsjax.System):
-    """The same under one, x <= 2 + a sin t, where the jump is written as a reset."""
+    """The same below a ceiling that moves, x <= 2 + a sin t, where the jump is written as a reset."""
 
     k: float = 0.3
     g: float = 1.0
