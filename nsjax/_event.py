@@ -204,6 +204,8 @@ def land(
 ) -> Landing:
     """Locates the earliest event of a step and makes the transition there."""
     found, te, before, slot, part = locate(model, stepper, t, t_next, y, f0, state, coefficients)
+    if model.contacts:
+        before = model.project(te, before, state)  # what lifts off must not do so from below the surface
     halted = te <= t
     fired = {k: jnp.zeros((), bool) for k in range(len(model.switches))}
     bounds = {k: jnp.zeros((), jnp.int32) for k in range(len(model.switches))}

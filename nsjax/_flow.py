@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._compact import compact_cond
@@ -108,12 +110,15 @@ class Flow(eqx.Module):
             for i, values in sampled([j / n for j in range(n + 1)], self.stepper.points(y, y1, ks), self.affine):
                 out[i].append(values)
         if not all(self.affine):
-            n = self.degree
+            n, eps = self.degree, float(jnp.finfo(t.dtype).eps)
             others = tuple(not affine for affine in self.affine)
-            for i, values in sampled([float(u) for u in nodes(n)], self.stepper.samples(y, y1, ks, n), others):
+            points = [*self.stepper.samples(y, y1, ks, n), _jittered(y, 64 * eps)]
+            for i, (*values, other) in sampled([*map(float, nodes(n)), 0.0], points, others):
                 v = jnp.stack(values)
                 tail = jnp.max(jnp.abs(jnp.asarray(to_chebyshev(n)[-2:], t.dtype) @ v))
-                resolved = resolved & ~(tail > max(1e-7, 64 * float(jnp.finfo(t.dtype).eps)) * jnp.max(jnp.abs(v)))
+                # Shortly after a double root or a lift-off all of it is rounding, which a shorter step would not mend.
+                noise = jnp.abs(other - v[0])
+                resolved = resolved & ~(tail > max(1e-7, 64 * eps) * jnp.max(jnp.abs(v)) + noise)
                 out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ v))
         return out, resolved
 
@@ -302,6 +307,13 @@ class Flow(eqx.Module):
         result = RESULTS.where(tiny & ended, RESULTS.nonfinite_field, result)
         result = RESULTS.where(tiny & ~ended, RESULTS.dt_min_reached, result)
         return RESULTS.where(c.active, result, c.result)
+
+
+def _jittered(y: Y, size: float) -> Y:
+    """The state with every entry changed by the fraction `size`, up or down."""
+    flat, unravel = jfu.ravel_pytree(y)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], flat.shape)
+    return unravel(flat * jnp.asarray(1 + size * signs, flat.dtype))
 
 
 def _survey(coefficients: list, known: list) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
