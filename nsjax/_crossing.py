@@ -17,7 +17,7 @@ from ._once import once
 
 
 UNROLLED = 3  # steps of Halley's method on a root before a loop takes over
-DEPTH = 40  # bisections: closer roots than 2**-40 of a step are one
+DEPTH = 40  # bisections: closer roots than 2**-40 of a step are one (2**-30 where jax has no 64-bit integers)
 
 
 def nodes(degree: int) -> np.ndarray:
@@ -157,7 +157,7 @@ def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], 
     """The earliest τ in [0, 1] at which the maximum of the polynomials over the parts is no longer positive.
 
     Walks through dyadic intervals from the left: one without a root is passed, one with exactly one is done, any other
-    is halved. A root that 40 halvings do not separate from its neighbour (a double root) is reported where it is.
+    is halved. A root that so many halvings do not separate from its neighbour (a double root) is reported where it is.
 
     **Arguments:**
 
@@ -165,7 +165,9 @@ def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], 
 
     **Returns:** whether there is one, and its place (1 if there is none).
     """
-    one = jnp.ones((), c.dtype)
+    one, zero = jnp.ones((), c.dtype), jnp.zeros((), jnp.result_type(int))
+    wide = zero.dtype == jnp.int64
+    depth = DEPTH if wide else 30
 
     def look(local: Array, level: Array) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Whether an interval has no root, and whether it has one that need not be isolated further."""
@@ -174,7 +176,7 @@ def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], 
         single = (variations == 1) & positive[:, 0]
         others_negative = jnp.sum(jnp.any(positive, axis=-1)) == 1
         begun = ~jnp.any(positive[:, 0])
-        return no_root(local), begun | (jnp.any(single) & others_negative) | (level >= DEPTH)
+        return no_root(local), begun | (jnp.any(single) & others_negative) | (level >= depth)
 
     def busy(state: tuple) -> Bool[Array, ""]:
         _, _, _, free, sure, over = state
@@ -186,7 +188,7 @@ def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], 
         after = index + 1
         up = jnp.zeros_like(level)
         moved = after
-        for shift in (32, 16, 8, 4, 2, 1):
+        for shift in (32, 16, 8, 4, 2, 1)[0 if wide else 1 :]:
             even = (moved & ((1 << shift) - 1)) == 0
             up = up + jnp.where(even, shift, 0)
             moved = jnp.where(even, moved >> shift, moved)
@@ -197,7 +199,6 @@ def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], 
         local = jnp.where(level == 0, c, _restrict(c, a * width, (a + 1) * width))
         return level, index, local, *look(local, level), over
 
-    zero = jnp.zeros((), jnp.result_type(int))
     free, sure = look(c, zero)
     level, index, local, free, _, over = jax.lax.while_loop(busy, walk, (zero, zero, c, free, sure, free))
     found = ~over & ~free

@@ -8,7 +8,7 @@ import pytest
 import reference
 from models import flat, Hammer, itinerary, Motion, pid, times
 
-from nsjax import gallery, RESULTS, solve
+from nsjax import find_orbit, gallery, RESULTS, solve
 
 
 def single(tree):
@@ -58,6 +58,20 @@ def test_ball_in_single_precision():
     np.testing.assert_allclose(times(sol), ball.impact_times, atol=1e-5)
     t = jnp.linspace(0, 3.5, 2001, dtype=jnp.float32)
     assert jax.vmap(sol)(t).x.min() > -1e-6
+
+
+def test_jax_as_it_comes():
+    """Where nobody has called for 64 bits there are not even integers of them."""
+    exact = reference.simulate(reference.StickSlip(), 20.0, (2.5, -0.5))
+    with jax.enable_x64(False):
+        sol = solve(gallery.StickSlip(), 0.0, 20.0, Motion(2.5, -0.5))
+        slope = jax.jacfwd(lambda v: solve(gallery.StickSlip(v_dr=v), 0.0, 20.0, Motion(2.5, -0.5)).y1.x)(0.2)
+        orbit = find_orbit(gallery.StickSlip(), Motion(2.5, -0.5), period=12.0)
+    np.testing.assert_allclose(times(sol), [float(e.t) for e in exact.events], atol=1e-3)
+    np.testing.assert_allclose(flat(sol.y1), reference.floats(exact.y), atol=1e-3)
+    double = jax.jacfwd(lambda v: solve(gallery.StickSlip(v_dr=v), 0.0, 20.0, Motion(2.5, -0.5)).y1.x)(0.2)
+    np.testing.assert_allclose(slope, double, rtol=1e-3)
+    np.testing.assert_allclose(orbit.period, reference.stick_slip_period(0.2), rtol=1e-4)
 
 
 @pytest.mark.parametrize("rtol", [1e-8, 5e-7, np.float32(1e-7), np.float64(1e-10)])
