@@ -17,4 +17,5 @@ from ._solution import (
 )
 from ._solve import solve as solve
 from ._system import impact as impact, relay as relay, sgn as sgn, System as System
+from ._taylor import Taylor as Taylor
 from ._variational import fundamental_matrix as fundamental_matrix

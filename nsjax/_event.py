@@ -40,8 +40,8 @@ class Landing(NamedTuple):
 
 def _step_to(te: Scalar, stepper: Stepper, args: tuple) -> tuple[Y, list[Y]]:
     model, t, y, f0, state, *_ = args
-    y_end, _, increments, _ = stepper(lambda t, y: model.flow(t, y, state), t, te, y, f0)
-    return y_end, increments
+    step = stepper(model, state, t, te, y, f0)
+    return step.y1, step.ks
 
 
 def _guard(te: Scalar, y: Y, args: tuple) -> Scalar:
@@ -106,7 +106,7 @@ def locate(
     def guards(t: Scalar, y: Y) -> Array:
         return model.stacked(frozen_model.guards(t, y, state), -1.0)
 
-    y_guess, *_ = stepper(flow, start, guess, y_start, f_start)
+    y_guess = stepper(frozen_model, state, start, guess, y_start, f_start).y1
     f = flow(guess, y_guess)
     one = jnp.ones_like(guess)
     values, rates = jax.jvp(guards, (guess, y_guess), (one, f))

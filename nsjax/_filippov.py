@@ -133,7 +133,7 @@ class Model(eqx.Module):
         f = self.flow(t, y, state)
         return jax.jvp(lambda t, y: _pick(self.h(k, t, y), state.part[k]), (t, y), (jnp.ones_like(t), f))[1]
 
-    def _signs(self, t: Scalar, state: State) -> tuple[Any, ...]:
+    def signs(self, t: Scalar, state: State) -> tuple[Any, ...]:
         """Switch values of a mode, with 0 for those which are held, and for contacts."""
         return tuple(
             jnp.zeros((), t.dtype) if isinstance(switch, impact) else m.astype(t.dtype)
@@ -160,7 +160,7 @@ class Model(eqx.Module):
 
     def values(self, t: Scalar, y: Y, state: State) -> tuple[Any, ...]:
         """The value of every switch in a mode: signs, and the multipliers λ of those that are held, (2.20)."""
-        s = self._signs(t, state)
+        s = self.signs(t, state)
         which = self.holdable
         if not which:
             return s
@@ -238,12 +238,15 @@ class Model(eqx.Module):
     def width(self) -> int:
         return max(self.parts, default=1)
 
-    def guards(self, t: Scalar, y: Y, state: State, wanted: tuple[bool, ...] | None = None) -> list[list[Scalar]]:
+    def guards(
+        self, t: Scalar, y: Y, state: State, wanted: tuple[bool, ...] | None = None, s: tuple[Any, ...] | None = None
+    ) -> list[list[Scalar]]:
         """`guards[slot][part]` (of the slots that are `wanted`, else empty), as scalars: stacked arrays of two or
-        five cost XLA's CPU code several times as much."""
+        five cost XLA's CPU code several times as much. `s`: the values of the switches, if they are known."""
         one = jnp.ones((), t.dtype)
         wanted = (True,) * len(self.slots) if wanted is None else wanted
-        s = self.values(t, y, state) if any(w and slot.holding for w, slot in zip(wanted, self.slots)) else ()
+        if s is None:
+            s = self.values(t, y, state) if any(w and slot.holding for w, slot in zip(wanted, self.slots)) else ()
         rows = []
         for slot, want in zip(self.slots, wanted):
             if not want:

@@ -10,20 +10,17 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import equinox as eqx
 import jax
-import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._compact import compact_cond
-from ._crossing import elevate, nodes, to_bernstein, to_chebyshev
 from ._event import land, Landing
 from ._filippov import Model, State
 from ._once import once
 from ._save import Log, Saved
 from ._solution import RESULTS
-from ._step import stack, Stepper
+from ._step import stack, Step, Stepper, unresolved, Watch
 from ._system import frozen
 from ._types import Scalar, Y
 
@@ -54,15 +51,12 @@ class Carry(eqx.Module):
 class _Attempt(NamedTuple):
     """A step of the solver, before it is known whether an event cuts it short."""
 
-    t_next: Scalar
-    y1: Y
-    ks: list[Y]
+    step: Step
     keep: Bool[Array, ""]  # whether it is accepted
     dt: Scalar  # length of the next
     halvings: Int[Array, ""]
     controller: PyTree
     result: RESULTS
-    coefficients: list[list[list[Scalar]]]  # of the guards along it
     busy: Bool[Array, ""]  # whether one of them may have a root
 
 
@@ -80,60 +74,12 @@ class Flow(eqx.Module):
     want_points: bool = eqx.field(static=True)
     meter: dfx.AbstractProgressMeter
     affine: tuple[bool, ...] = eqx.field(static=True)  # whether each guard is affine in (t, y)
-    degree: int = eqx.field(static=True)  # of the polynomial for one that is not
     reverse: bool = eqx.field(static=True)  # whether the loop is to be transposed
 
-    def coefficients(
-        self, t: Scalar, t_next: Scalar, y: Y, y1: Y, ks: list[Y], state: State
-    ) -> tuple[list[list[list[Scalar]]], Bool[Array, ""]]:
-        """Bernstein coefficients `[slot][part][j]` of the guards along a step, and whether they represent them well.
-
-        A guard affine in (t, y) has its values at the control points as coefficients; any other is interpolated, and
-        the size of its last Chebyshev coefficients tells whether a polynomial of that degree can stand for it.
-        """
-        out: list[list[list[Scalar]]] = [[] for _ in self.model.slots]
-        resolved = jnp.ones((), bool)
-        dt = t_next - t
-
-        def sampled(at: list[float], points: list[Y], wanted: tuple[bool, ...]) -> list[tuple[int, list[Scalar]]]:
-            """(slot, values along the step) for every part of the guards that are wanted."""
-            if len(self.model.holdable) > 1:  # the multipliers of all points by one call of the linear solver
-                ts = t + dt * jnp.asarray(at, t.dtype)
-                batch = jax.vmap(lambda t, y: self.model.guards(t, y, state, wanted))(ts, stack(points))
-                rows = [jax.tree.map(lambda x, j=j: x[j], batch) for j in range(len(at))]
-            else:
-                rows = [self.model.guards(t + dt * u, y, state, wanted) for u, y in zip(at, points)]
-            return [(i, list(part)) for i, _ in enumerate(wanted) for part in zip(*[row[i] for row in rows])]
-
-        if any(self.affine):
-            n = self.stepper.degree
-            for i, values in sampled([j / n for j in range(n + 1)], self.stepper.points(y, y1, ks), self.affine):
-                out[i].append(values)
-        if not all(self.affine):
-            n, eps = self.degree, float(jnp.finfo(t.dtype).eps)
-            others = tuple(not affine for affine in self.affine)
-            points = [*self.stepper.samples(y, y1, ks, n), _jittered(y, 64 * eps)]
-            for i, (*values, other) in sampled([*map(float, nodes(n)), 0.0], points, others):
-                v = jnp.stack(values)
-                tail = jnp.max(jnp.abs(jnp.asarray(to_chebyshev(n)[-2:], t.dtype) @ v))
-                # Shortly after a double root or a lift-off all of it is rounding, which a shorter step would not mend.
-                noise = jnp.abs(other - v[0])
-                resolved = resolved & ~(tail > max(1e-7, 64 * eps) * jnp.max(jnp.abs(v)) + noise)
-                out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ v))
-        return out, resolved
-
     def stacked(self, coefficients: list[list[list[Scalar]]]) -> Float[Array, "slots parts coefficients"]:
-        """The same as one array, of one degree."""
-        n = self.stepper.degree if all(self.affine) else self.degree
-        dtype = self.t0.dtype
-        rows = [
-            [
-                jnp.stack(c) if len(c) == n + 1 else jnp.asarray(elevate(len(c) - 1, n), dtype) @ jnp.stack(c)
-                for c in row
-            ]
-            for row in coefficients
-        ]
-        return self.model.stacked(rows, -1.0)
+        """Bernstein coefficients of the guards as one array, of one degree."""
+        n = max(len(c) for row in coefficients for c in row) - 1
+        return self.model.stacked([[self.stepper.bernstein(c, n) for c in row] for row in coefficients], -1.0)
 
     def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list) -> Landing:
         """The step once more, to its first event."""
@@ -144,48 +90,57 @@ class Flow(eqx.Module):
         """A step of the solver, its error against the tolerance, and whether a guard may have a root on it."""
         model, stepper = self.model, self.stepper
 
-        def flow(t: Scalar, y: Y) -> Y:
-            return model.flow(t, y, c.state)
-
         t_next = jnp.where(c.t + c.dt >= self.t1, self.t1, c.t + c.dt)
-        y1, error, ks, _ = stepper(flow, c.t, t_next, c.y, c.f)
-        # An error that is not a number is too large.
-        error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
-        terms = dfx.ODETerm(lambda t, y, args: flow(t, y))
-        # The step size is no function to be differentiated; powers of an error of zero are not even differentiable.
-        t_still, t_next_still, y_still, y1_still, error = frozen((c.t, t_next, c.y, y1, error))
-        # A step that overflows is too long, but must not make the next one infinity divided by infinity.
-        y1_still = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), y1_still, y_still)
-        order = stepper.solver.error_order(terms)
-        keep, a, b, _, controller, outcome = self.controller.adapt_step_size(
-            t_still, t_next_still, y_still, y1_still, None, error, order, c.controller
-        )
-        dt, halvings, result = b - a, c.halvings, RESULTS.promote(outcome)
-        coefficients, busy = [], jnp.zeros((), bool)
+        step = stepper(model, c.state, c.t, t_next, c.y, c.f, Watch(self.affine, self.controller))
+        t_next = step.t_next
+        keep, dt, controller, outcome = self.pace(c, step)
+        halvings, result = c.halvings, RESULTS.promote(outcome)
+        busy = jnp.zeros((), bool)
         if model.slots:
-            coefficients, resolved = self.coefficients(c.t, t_next, c.y, y1, ks, c.state)
-            is_finite, quiet = _survey(coefficients, model.known_roots(c.state))
+            is_finite, quiet = self.survey(step.guards, model.known_roots(c.state))
             result = RESULTS.where(keep & ~is_finite, RESULTS.nonfinite_field, result)
             # A guard that is no polynomial to the precision needed is not trusted: a shorter step is. (At most so
             # often: one with a kink never is.)
             # Nor is a step so short that rounding of time alone spoils the polynomial.
             eps = float(jnp.finfo(c.t.dtype).eps)
-            floor = 4 * eps / max(1e-7, 64 * eps) * jnp.maximum(jnp.abs(c.t), self.t1 - self.t0)
-            poor = keep & is_finite & ~resolved & (halvings < 30) & (t_next - c.t > floor)
+            floor = 4 * eps / unresolved(c.t.dtype) * jnp.maximum(jnp.abs(c.t), self.t1 - self.t0)
+            poor = keep & is_finite & ~step.resolved & (halvings < 30) & (t_next - c.t > floor)
             halvings = jnp.where(poor, halvings + 1, jnp.where(keep, 0, halvings))
             keep = keep & ~poor
             dt = jnp.where(poor, 0.5 * (t_next - c.t), dt)
             # On the last few ulps before the end the polynomials are rounding.
             busy = c.active & keep & is_finite & ~quiet & (t_next - c.t > 4 * eps * jnp.abs(c.t))
-        return _Attempt(t_next, y1, ks, keep & c.active, dt, halvings, controller, result, coefficients, busy)
+        return _Attempt(step, keep & c.active, dt, halvings, controller, result, busy)
 
-    def arrive(self, c: Carry, step: _Attempt) -> Landing:
+    def pace(self, c: Carry, step: Step) -> tuple[Bool[Array, ""], Scalar, PyTree, Any]:
+        """Whether a step is accurate enough, the length of the next, and the controller's state and verdict."""
+        model, t, t_next = self.model, *frozen((c.t, step.t_next))
+        own = self.stepper.pace(self.controller, *frozen((step, c.t, c.y)), self.t1 - self.t0)
+        if own is not None:
+            return *own, c.controller, dfx.RESULTS.successful
+        # An error that is not a number is too large.
+        error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), step.error)
+        terms = dfx.ODETerm(lambda t, y, args: model.flow(t, y, c.state))
+        # The step size is no function to be differentiated; powers of an error of zero are not even differentiable.
+        y, y1, error = frozen((c.y, step.y1, error))
+        # A step that overflows is too long, but must not make the next one infinity divided by infinity.
+        y1 = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), y1, y)
+        order = self.stepper.solver.error_order(terms)
+        keep, a, b, _, controller, outcome = self.controller.adapt_step_size(
+            t, t_next, y, y1, None, error, order, c.controller
+        )
+        return keep, b - a, controller, outcome
+
+    def survey(self, coefficients: list, known: list) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+        """Whether all coefficients are finite, and whether certainly no guard has a root on the step but those known:
+        one of its parts is positive all along."""
+        rows = [ft.reduce(jnp.maximum, map(self.stepper.least, row, roots)) for row, roots in zip(coefficients, known)]
+        return finite(coefficients), once(ft.reduce(jnp.minimum, rows)) > 0
+
+    def arrive(self, c: Carry, attempt: _Attempt) -> Landing:
         """Where the step leads: to its end, or to the first event on it."""
         model = self.model
-
-        def flow(t: Scalar, y: Y) -> Y:
-            return model.flow(t, y, c.state)
-
+        step = attempt.step
         t, no = step.t_next, jnp.zeros((), bool)
         y_end = model.project(t, step.y1, c.state)
         points = stack(self.stepper.points(c.y, step.y1, step.ks)) if self.want_points else None
@@ -195,7 +150,7 @@ class Flow(eqx.Module):
             t_after=t,
             y_before=step.y1,
             y_after=y_end,
-            f_after=self.stepper.last_slope(step.ks, t - c.t, flow, t, y_end),
+            f_after=model.flow(t, y_end, c.state) if step.slope is None else step.slope,
             state=c.state,
             slot=jnp.zeros((), jnp.int32),
             news=no,
@@ -207,10 +162,10 @@ class Flow(eqx.Module):
         )
         if not model.slots:
             return end
-        here = (c.t, t, c.y, c.f, c.state, lax.stop_gradient(step.coefficients))
-        there = _landed(step.busy, self, here, end)
+        here = (c.t, t, c.y, c.f, c.state, lax.stop_gradient(step.guards))
+        there = _landed(attempt.busy, self, here, end)
         # A lane that looked for a root may have found none.
-        event = step.busy & there.found
+        event = attempt.busy & there.found
         there = jax.tree.map(lambda a, b: jnp.where(event, a, b), there, end)
         return there._replace(
             state=there.state._replace(roots=tuple(jnp.where(event, r, 0) for r in there.state.roots))
@@ -303,28 +258,10 @@ class Flow(eqx.Module):
         # Rejected again and again, down to nothing: at a place where the field ends, or where it is too rough.
         least = 1e-6 * float(jnp.finfo(t.dtype).eps) * (self.t1 - self.t0)
         tiny = ~moved & ((t + step.dt <= t) | (step.dt <= least)) & (result == RESULTS.successful)
-        ended = ~finite(step.y1)
+        ended = ~finite(step.step.y1)
         result = RESULTS.where(tiny & ended, RESULTS.nonfinite_field, result)
         result = RESULTS.where(tiny & ~ended, RESULTS.dt_min_reached, result)
         return RESULTS.where(c.active, result, c.result)
-
-
-def _jittered(y: Y, size: float) -> Y:
-    """The state with every entry changed by the fraction `size`, up or down."""
-    flat, unravel = jfu.ravel_pytree(y)
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], flat.shape)
-    return unravel(flat * jnp.asarray(1 + size * signs, flat.dtype))
-
-
-def _survey(coefficients: list, known: list) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether all coefficients are finite, and whether certainly no guard has a root on the step: one of its parts is
-    positive in all coefficients but those which vanish with its known roots."""
-
-    def least(c: list[Scalar], roots: Int[Array, ""]) -> Scalar:
-        return ft.reduce(jnp.minimum, [jnp.where(j < roots, 1, x) if j < 3 else x for j, x in enumerate(c)])
-
-    rows = [ft.reduce(jnp.maximum, map(least, row, roots)) for row, roots in zip(coefficients, known)]
-    return finite(coefficients), once(ft.reduce(jnp.minimum, rows)) > 0
 
 
 def finite(tree: Any) -> Bool[Array, ""]:

@@ -20,9 +20,9 @@ from ._jacobian import dense_jacobian
 from ._save import Log, Saved
 from ._solution import Events, is_okay, RESULTS, Solution
 from ._start import start_mode
-from ._step import Stepper
 from ._structure import is_affine
 from ._system import arrays_of, System
+from ._taylor import make_stepper
 from ._types import Scalar, Y
 
 
@@ -66,7 +66,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     start, stop = t0 * direction, t1 * direction
     model = Model(system, direction, start, y0)
     start = check_contacts(model, start, y0)
-    stepper = Stepper(solver)
+    stepper = make_stepper(solver)
     max_events = max_events if model.slots else 0
     state, forked, result = start_mode(model, start, y0, given)
     f0 = model.flow(start, y0, state)
@@ -99,7 +99,6 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         want_points=saveat.dense or request.ts is not None,
         meter=meter,
         affine=affine,
-        degree=max(8, stepper.degree + 3),
         reverse=reverse,
     )
     zero = jnp.zeros((), jnp.int32)

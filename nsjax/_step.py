@@ -4,19 +4,22 @@ Explicit Runge-Kutta stages are unrolled from the solver's own tableau (diffrax 
 times as much for small systems and under `jacfwd`); every other solver takes its own `step`.
 """
 
+import abc
 import functools as ft
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from ._crossing import nodes, to_bernstein
+from ._crossing import elevate, nodes, to_bernstein, to_chebyshev
+from ._filippov import Model, State
 from ._once import once
 from ._types import Scalar, Y
 
@@ -60,11 +63,70 @@ def _dense_weights(solver_type: type, stages: int, x64: bool) -> tuple[np.ndarra
     return values, int(np.flatnonzero(size > noise)[-1])
 
 
+class Step(NamedTuple):
+    """A step in a fixed mode."""
+
+    t_next: Scalar
+    y1: Y
+    error: Y | None  # its estimate; None if the method has none
+    ks: list[Y]  # increments, of which dense output is made
+    slope: Y | None = None  # the field at its end, if it is known
+    guards: list[list[list[Scalar]]] = []  # `[slot][part][j]`: coefficients of polynomials that stand for the guards
+    resolved: Bool[Array, ""] | bool = True  # whether they do so well
+
+
+class Watch(NamedTuple):
+    """What is wanted of a step that may be kept."""
+
+    affine: tuple[bool, ...]  # of each guard whether it is affine in (t, y)
+    controller: dfx.AbstractStepSizeController
+
+
 class Stepper(eqx.Module):
     """Takes steps with `solver`.
 
     `degree` is that of the dense output; `points(...)` gives its control points, `degree + 1` states whose Bernstein
-    combination it is. For an affine h the Bernstein coefficients of h along the step are h at the control points.
+    combination it is.
+    """
+
+    solver: eqx.AbstractVar[dfx.AbstractSolver]
+    degree: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def __call__(
+        self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watch | None = None
+    ) -> Step:
+        """A step from `t`, where the field is `f0`, to `t_next`.
+
+        With `watch` also the polynomials of the guards; and a method that knows in advance how far it is accurate may
+        go only so far towards `t_next`.
+        """
+
+    @abc.abstractmethod
+    def points(self, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
+        """The `degree + 1` control points of the dense output."""
+
+    def least(self, c: list[Scalar], roots: Int[Array, ""]) -> Scalar:
+        """A lower bound, up to a positive factor, of such a polynomial once its known roots at the start are divided
+        out: here the smallest of its Bernstein coefficients, of which the first vanish with these roots."""
+        return ft.reduce(jnp.minimum, [jnp.where(j < roots, 1, x) if j < 3 else x for j, x in enumerate(c)])
+
+    def bernstein(self, c: list[Scalar], degree: int) -> Float[Array, " coefficients"]:
+        """Its Bernstein coefficients, those of `degree`."""
+        raised = jnp.stack(c)
+        return raised if len(c) == degree + 1 else jnp.asarray(elevate(len(c) - 1, degree), raised.dtype) @ raised
+
+    def pace(self, controller: Any, step: Step, t: Scalar, y: Y, length: Scalar) -> Any:
+        """Whether a step is accurate enough and how long the next may be, for a method that finds this out itself; the
+        others leave it to the controller."""
+        return None
+
+
+class RungeKutta(Stepper):
+    """Steps of a diffrax Runge-Kutta method.
+
+    A guard affine in (t, y) has its values at the control points as Bernstein coefficients; any other is interpolated,
+    and the size of its last Chebyshev coefficients tells whether a polynomial of that degree can stand for it.
     """
 
     solver: dfx.AbstractSolver
@@ -84,9 +146,19 @@ class Stepper(eqx.Module):
         self.solver = solver
         self.degree = _dense_weights(type(solver), self.stages, _double())[1]
 
-    def __call__(self, f: Field, t: Scalar, t_next: Scalar, y: Y, f0: Y) -> tuple[Y, Y | None, list[Y], Any]:
-        """**Returns:** y at `t_next`, the error estimate (None if the method has none), the increments k, and
-        diffrax's result (None when the step cannot fail)."""
+    def __call__(
+        self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watch | None = None
+    ) -> Step:
+        step = self.step(model, state, t, t_next, y, f0)
+        if watch is None or not model.slots:
+            return step
+        guards, resolved = self.guards(model, state, watch.affine, t, y, step)
+        return step._replace(guards=guards, resolved=resolved)
+
+    def step(self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y) -> Step:
+        def f(t: Scalar, y: Y) -> Y:
+            return model.flow(t, y, state)
+
         dt = t_next - t
         if isinstance(self.solver, dfx.AbstractERK):
             tableau = self.solver.tableau
@@ -98,19 +170,15 @@ class Stepper(eqx.Module):
                 ks.append(scale(f(t_next if c == 1 else t + float(c) * dt, stage)))
             y1 = stage if tableau.ssal else _combine(y, list(zip(map(float, tableau.b_sol), ks)))
             error = _combine(jax.tree.map(jnp.zeros_like, y), list(zip(map(float, tableau.b_error), ks)))
-            return y1, error, ks, None
-        terms = dfx.ODETerm(lambda t, y, args: f(t, y))
-        state = self.solver.init(terms, t, t_next, y, None)
-        y1, error, dense, _, result = self.solver.step(terms, t, t_next, y, None, state, made_jump=True)
-        ks = [jax.tree.map(lambda k, i=i: k[i], dense["k"]) for i in range(self.stages)]
-        return y1, error, ks, result
-
-    def last_slope(self, ks: list[Y], dt: Scalar, f: Field, t: Scalar, y: Y) -> Y:
-        """f at the end of the step; free when the first stage of the next step is the last of this one."""
-        if isinstance(self.solver, dfx.AbstractERK) and self.solver.tableau.fsal:  # pyright: ignore
+            # Free when the first stage of the next step is the last of this one.
             safe = jnp.where(dt == 0, 1, dt)
-            return jax.tree.map(lambda k: k / safe, ks[-1])
-        return f(t, y)
+            slope = jax.tree.map(lambda k: k / safe, ks[-1]) if tableau.fsal else None
+            return Step(t_next, y1, error, ks, slope)
+        terms = dfx.ODETerm(lambda t, y, args: f(t, y))
+        memory = self.solver.init(terms, t, t_next, y, None)
+        y1, error, dense, *_ = self.solver.step(terms, t, t_next, y, None, memory, made_jump=True)
+        ks = [jax.tree.map(lambda k, i=i: k[i], dense["k"]) for i in range(self.stages)]
+        return Step(t_next, y1, error, ks)
 
     def _weighted(self, matrix: np.ndarray, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
         rows = []
@@ -134,12 +202,55 @@ class Stepper(eqx.Module):
         return few
 
     def points(self, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
-        """The `degree + 1` control points of the dense output."""
         return self._weighted(to_bernstein(self.degree) @ self._values(nodes(self.degree)), y, y1, ks)
 
-    def samples(self, y: Y, y1: Y, ks: list[Y], degree: int) -> list[Y]:
-        """The dense output at `nodes(degree)`."""
-        return self._weighted(self._values(nodes(degree)), y, y1, ks)
+    def guards(
+        self, model: Model, state: State, affine: tuple[bool, ...], t: Scalar, y: Y, step: Step
+    ) -> tuple[list[list[list[Scalar]]], Bool[Array, ""]]:
+        """Bernstein coefficients `[slot][part][j]` of the guards along a step, and whether they represent them well."""
+        out: list[list[list[Scalar]]] = [[] for _ in affine]
+        resolved = jnp.ones((), bool)
+        dt = step.t_next - t
+
+        def sampled(at: list[float], points: list[Y], wanted: tuple[bool, ...]) -> list[tuple[int, list[Scalar]]]:
+            """(slot, values along the step) for every part of the guards that are wanted."""
+            if len(model.holdable) > 1:  # the multipliers of all points by one call of the linear solver
+                ts = t + dt * jnp.asarray(at, t.dtype)
+                batch = jax.vmap(lambda t, y: model.guards(t, y, state, wanted))(ts, stack(points))
+                rows = [jax.tree.map(lambda x, j=j: x[j], batch) for j in range(len(at))]
+            else:
+                rows = [model.guards(t + dt * u, y, state, wanted) for u, y in zip(at, points)]
+            return [(i, list(part)) for i, _ in enumerate(wanted) for part in zip(*[row[i] for row in rows])]
+
+        if any(affine):
+            n = self.degree
+            for i, values in sampled([j / n for j in range(n + 1)], self.points(y, step.y1, step.ks), affine):
+                out[i].append(values)
+        if not all(affine):
+            n, eps = max(8, self.degree + 3), float(jnp.finfo(t.dtype).eps)
+            others = tuple(not each for each in affine)
+            points = self._weighted(self._values(nodes(n)), y, step.y1, step.ks)
+            points.append(_jittered(y, 64 * eps))
+            for i, (*values, other) in sampled([*map(float, nodes(n)), 0.0], points, others):
+                v = jnp.stack(values)
+                tail = jnp.max(jnp.abs(jnp.asarray(to_chebyshev(n)[-2:], t.dtype) @ v))
+                # Shortly after a double root or a lift-off all of it is rounding, which a shorter step would not mend.
+                noise = jnp.abs(other - v[0])
+                resolved = resolved & ~(tail > unresolved(t.dtype) * jnp.max(jnp.abs(v)) + noise)
+                out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ v))
+        return out, resolved
+
+
+def unresolved(dtype: Any) -> float:
+    """The part of a guard that may be missing from the polynomial which stands for it."""
+    return max(1e-7, 64 * float(jnp.finfo(dtype).eps))
+
+
+def _jittered(y: Y, size: float) -> Y:
+    """The state with every entry changed by the fraction `size`, up or down."""
+    flat, unravel = jfu.ravel_pytree(y)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], flat.shape)
+    return unravel(flat * jnp.asarray(1 + size * signs, flat.dtype))
 
 
 def stack(points: list[Y]) -> Y:

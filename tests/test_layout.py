@@ -22,6 +22,8 @@ ORDER = (
     "_filippov",
     "_crossing",
     "_step",
+    "_series",
+    "_taylor",
     "_solution",
     "_sensitivity",
     "_save",
