@@ -2,6 +2,7 @@
 
 from . import gallery as gallery, plot as plot
 from ._orbit import find_orbit as find_orbit, Orbit as Orbit
+from ._regularise import banded as banded, smoothed as smoothed
 from ._saltation import (
     saltation_matrices as saltation_matrices,
     saltation_matrix as saltation_matrix,

@@ -20,6 +20,12 @@ def _shape(tree: Any) -> Any:
     return jax.tree.map(lambda x: f"{x.dtype.name}{list(x.shape)}", tree)
 
 
+def check_system(system: Any) -> None:
+    if not isinstance(system, System):
+        hint = " Call it: `solve(Model(), ...)`." if isinstance(system, type) else ""
+        raise TypeError(f"Argument `system` must be an instance of `nsjax.System`, but got {system!r}.{hint}")
+
+
 def check_solve(
     system: System,
     t0: Any,
@@ -33,9 +39,7 @@ def check_solve(
     max_events: Any,
 ) -> tuple[Y, Scalar, Scalar, Any, dfx.AbstractStepSizeController, dict[str, Any]]:
     """Converts and checks the arguments of `solve`."""
-    if not isinstance(system, System):
-        hint = " Call it: `solve(Model(), ...)`." if isinstance(system, type) else ""
-        raise TypeError(f"Argument `system` must be an instance of `nsjax.System`, but got {system!r}.{hint}")
+    check_system(system)
     if not isinstance(solver, dfx.AbstractSolver):
         raise TypeError(f"Argument `solver` must be a diffrax solver such as `diffrax.Tsit5()`, but got {solver!r}.")
     leaves = jax.tree.leaves(y0)

@@ -35,6 +35,7 @@ ORDER = (
     "_solve",
     "_saltation",
     "_variational",
+    "_regularise",
     "_orbit",
     "gallery",
     "plot",
