@@ -87,10 +87,11 @@ def test_values_of_the_switch_model():
         assert value(x, v)[0] == s
     for x, v in ((1.5, 0.205), (-1.5, 0.205), (0.3, 0.191)):
         np.testing.assert_allclose(value(x, v)[1], -7 * (v - 0.2), rtol=1e-12)
-    # Both are beyond their bound, λ = (2, 1.2), until the first is released.
-    pair = banded(Pair(w=1.0, g=0.4, c=-1.0), 1e-2)
-    s = pair.put(jnp.array(2.8), Plane(0.0, 0.0), pair.values(()))
-    np.testing.assert_allclose([s["a"], s["b"]], [1, 0.7], rtol=1e-12)
+    # Both are beyond their bound; λ = (2, 1.2) until the first is released, (11/3, 10/3) and then (1, 2).
+    for t, g, expected in ((2.8, 0.4, [1, 0.7]), (4.0, 3.0, [1, 1])):
+        pair = banded(Pair(w=1.0, g=g, c=-1.0), 1e-2)
+        s = pair.put(jnp.array(t), Plane(0.0, 0.0), pair.values(()))
+        np.testing.assert_allclose([s["a"], s["b"]], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("key", ["example 2.3", "example 2.5", "3.5", "1.1(1)"])
