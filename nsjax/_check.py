@@ -22,7 +22,7 @@ def _shape(tree: Any) -> Any:
 
 def check_system(system: Any) -> None:
     if not isinstance(system, System):
-        hint = " Call it: `solve(Model(), ...)`." if isinstance(system, type) else ""
+        hint = " Call it, with its parameters: `Model(...)`." if isinstance(system, type) else ""
         raise TypeError(f"Argument `system` must be an instance of `nsjax.System`, but got {system!r}.{hint}")
 
 
@@ -37,6 +37,7 @@ def check_solve(
     saveat: Any,
     max_steps: Any,
     max_events: Any,
+    adjoint: Any,
 ) -> tuple[Y, Scalar, Scalar, Any, dfx.AbstractStepSizeController, dict[str, Any]]:
     """Converts and checks the arguments of `solve`."""
     check_system(system)
@@ -75,11 +76,12 @@ def check_solve(
         if getattr(saveat, name):
             raise ValueError(f"Argument `saveat` must not ask for `{name}`, which a flow with events does not have.")
     controller = _controller(controller, dtype)
-    return y0, t0, t1, _root_finder(solver, controller), controller, _given(system, mode)
+    return y0, t0, t1, _implicit(solver, controller, adjoint), controller, _given(system, mode)
 
 
-def _root_finder(solver: Any, controller: Any) -> Any:
-    """Gives an implicit solver's root finder the tolerances of the step size controller, as diffrax does."""
+def _implicit(solver: Any, controller: Any, adjoint: Any) -> Any:
+    """Gives an implicit solver's root finder the tolerances of the step size controller, and the solver a kind of loop
+    that can be differentiated, as diffrax does."""
     if not isinstance(solver, dfx.AbstractImplicitSolver):
         return solver
     open_ = [n for n in ("rtol", "atol", "norm") if getattr(solver.root_finder, n) is use_stepsize_tol]
@@ -89,6 +91,8 @@ def _root_finder(solver: Any, controller: Any) -> Any:
             "tolerances, but got a fixed one. Use `diffrax.PIDController(rtol=..., atol=...)`, or pass "
             "`root_finder=diffrax.VeryChord(rtol=..., atol=..., norm=optimistix.max_norm)` to the solver."
         )
+    if getattr(solver, "scan_kind", "") is None and not isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
+        solver = eqx.tree_at(lambda s: s.scan_kind, solver, "lax", is_leaf=lambda x: x is None)
     return eqx.tree_at(
         lambda s: [getattr(s.root_finder, n) for n in open_], solver, [getattr(controller, n) for n in open_]
     )

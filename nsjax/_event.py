@@ -84,6 +84,7 @@ def locate(
     f0: Y,
     state: State,
     coefficients: Float[Array, "slots parts coefficients"],
+    noise: Float[Array, "slots parts"],
 ) -> tuple[Bool[Array, ""], Scalar, Y, Int[Array, ""], Int[Array, ""]]:
     """The earliest event of a step: its time, the state there, the slot and the part of the guard that fires.
 
@@ -93,18 +94,23 @@ def locate(
     """
     known = model.stacked(model.known_roots(state), 0)
     found, root = jax.vmap(first_root)(deflate(coefficients, known))
-    root = jnp.where(found, root, jnp.inf)
-    earliest = jnp.min(root)
     args = (model, t, y, f0, state)
     frozen_model, start, y_start, f_start, _ = frozen(args)
-    length = lax.stop_gradient(t_next) - start
-    guess = start + jnp.minimum(earliest, 1) * length
 
     def flow(t: Scalar, y: Y) -> Y:
         return frozen_model.flow(t, y, state)
 
     def guards(t: Scalar, y: Y) -> Array:
         return model.stacked(frozen_model.guards(t, y, state), -1.0)
+
+    # A multiplier that stays at its bound, or a guard which begins with a double root, has no sign if it does not rise
+    # above rounding on the whole step.
+    least = jnp.asarray([0 if slot.holding else 2 for slot in model.slots], known.dtype)[:, None]
+    found = found & ~jnp.any((jnp.max(jnp.abs(coefficients), axis=-1) <= noise) & (known >= least), axis=-1)
+    root = jnp.where(found, root, jnp.inf)
+    earliest = jnp.min(root)
+    length = lax.stop_gradient(t_next) - start
+    guess = start + jnp.minimum(earliest, 1) * length
 
     y_guess = stepper(frozen_model, state, start, guess, y_start, f_start).y1
     f = flow(guess, y_guess)
@@ -201,11 +207,12 @@ def land(
     f0: Y,
     state: State,
     coefficients: Float[Array, "slots parts coefficients"],
+    noise: Float[Array, "slots parts"],
 ) -> Landing:
     """Locates the earliest event of a step and makes the transition there."""
-    found, te, before, slot, part = locate(model, stepper, t, t_next, y, f0, state, coefficients)
-    if model.contacts:
-        before = model.project(te, before, state)  # what lifts off must not do so from below the surface
+    found, te, before, slot, part = locate(model, stepper, t, t_next, y, f0, state, coefficients, noise)
+    if model.holdable:
+        before = model.project(te, before, state)  # what leaves a surface must do so from there, and not from beside it
     halted = te <= t
     fired = {k: jnp.zeros((), bool) for k in range(len(model.switches))}
     bounds = {k: jnp.zeros((), jnp.int32) for k in range(len(model.switches))}

@@ -30,7 +30,8 @@ class Slot(NamedTuple):
 
 class State(NamedTuple):
     """A mode, with the component of h that is active on the surface of each switch (None for a smooth surface) and
-    the number of roots at the present instant, to be left out when the next one is sought."""
+    the number of roots at the present instant, to be left out when the next one is sought; of a switch that is held the
+    sign of the bound that its value is at, or 0."""
 
     mode: Mode
     part: tuple[Int[Array, ""] | None, ...]
@@ -292,9 +293,13 @@ class Model(eqx.Module):
         none = jnp.zeros((), jnp.int32)
         for k, j, holding in self.slots:
             roots, mode, part = state.roots[k], state.mode[k], state.part[k]
-            if holding:
-                row = [none]
-            elif part is None:
+            if k in self.holdable:
+                held = self.held(k, mode)
+                if holding:
+                    rows.append([jnp.where(held & (roots == j), 1, none)])
+                    continue
+                roots = jnp.where(held, none, roots)
+            if part is None:
                 row = [roots]
             elif isinstance(self.switches[k], impact):
                 row = [jnp.where(part == j, roots, none)]

@@ -41,6 +41,7 @@ class Carry(eqx.Module):
     events: Int[Array, ""]
     halted: Int[Array, ""]  # events in a row without progress in time
     halvings: Int[Array, ""]  # in a row, to resolve a guard
+    crawled: Int[Array, ""]  # steps in a row of a few units in the last place of time
     grazed: Bool[Array, ""]  # whether an event was tangential
     forked: Bool[Array, ""]  # whether another solution sets out from the start too, or branches off on the way
     log: Log | None
@@ -81,10 +82,11 @@ class Flow(eqx.Module):
         n = max(len(c) for row in coefficients for c in row) - 1
         return self.model.stacked([[self.stepper.bernstein(c, n) for c in row] for row in coefficients], -1.0)
 
-    def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list) -> Landing:
+    def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list, noise: list) -> Landing:
         """The step once more, to its first event."""
         polynomials = self.stacked(lax.stop_gradient(coefficients))
-        return land(self.model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials)
+        noises = self.model.stacked(lax.stop_gradient(noise), 0.0)
+        return land(self.model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials, noises)
 
     def attempt(self, c: Carry) -> _Attempt:
         """A step of the solver, its error against the tolerance, and whether a guard may have a root on it."""
@@ -97,25 +99,32 @@ class Flow(eqx.Module):
         halvings, result = c.halvings, RESULTS.promote(outcome)
         busy = jnp.zeros((), bool)
         if model.slots:
-            is_finite, quiet = self.survey(step.guards, model.known_roots(c.state))
+            known = model.known_roots(c.state)
+            is_finite, quiet = self.survey(step.guards, known)
             result = RESULTS.where(keep & ~is_finite, RESULTS.nonfinite_field, result)
             # A guard that is no polynomial to the precision needed is not trusted: a shorter step is. (At most so
             # often: one with a kink never is.)
             # Nor is a step so short that rounding of time alone spoils the polynomial.
             eps = float(jnp.finfo(c.t.dtype).eps)
             floor = 4 * eps / unresolved(c.t.dtype) * jnp.maximum(jnp.abs(c.t), self.t1 - self.t0)
-            poor = keep & is_finite & ~step.resolved & (halvings < 30) & (t_next - c.t > floor)
+            poor = ~step.resolved | _backward(step, known)
+            poor = poor & keep & is_finite & (halvings < 30) & (t_next - c.t > floor)
             halvings = jnp.where(poor, halvings + 1, jnp.where(keep, 0, halvings))
             keep = keep & ~poor
             dt = jnp.where(poor, 0.5 * (t_next - c.t), dt)
             # On the last few ulps before the end the polynomials are rounding.
             busy = c.active & keep & is_finite & ~quiet & (t_next - c.t > 4 * eps * jnp.abs(c.t))
+        if self.reverse:
+            # The derivatives of a rejected step that overflows are no numbers, and zero times that is none either.
+            still = step._replace(t_next=jnp.where(keep, t_next, c.t))
+            again = stepper(model, c.state, c.t, still.t_next, c.y, c.f)
+            step = still._replace(y1=again.y1, ks=again.ks, slope=again.slope)
         return _Attempt(step, keep & c.active, dt, halvings, controller, result, busy)
 
-    def pace(self, c: Carry, step: Step) -> tuple[Bool[Array, ""], Scalar, PyTree, Any]:
+    def pace(self, c: Carry, step: Step) -> tuple[Any, Any, PyTree, Any]:
         """Whether a step is accurate enough, the length of the next, and the controller's state and verdict."""
         model, t, t_next = self.model, *frozen((c.t, step.t_next))
-        own = self.stepper.pace(self.controller, *frozen((step, c.t, c.y)), self.t1 - self.t0)
+        own = self.stepper.pace(self.controller, frozen(step), t, frozen(c.y), self.t1 - self.t0)
         if own is not None:
             return *own, c.controller, dfx.RESULTS.successful
         # An error that is not a number is too large.
@@ -162,7 +171,7 @@ class Flow(eqx.Module):
         )
         if not model.slots:
             return end
-        here = (c.t, t, c.y, c.f, c.state, lax.stop_gradient(step.guards))
+        here = (c.t, t, c.y, c.f, c.state, lax.stop_gradient(step.guards), lax.stop_gradient(step.noise))
         there = _landed(attempt.busy, self, here, end)
         # A lane that looked for a root may have found none.
         event = attempt.busy & there.found
@@ -198,6 +207,9 @@ class Flow(eqx.Module):
         t, y, f, state = choose(moved, new, (c.t, c.y, c.f, c.state))
         steps = c.steps + c.active.astype(jnp.int32)
         done = t >= self.t1
+        few = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(c.t)
+        crawled = jnp.where(event | (step.step.t_next - c.t > few), 0, c.crawled + 1)
+        result = RESULTS.where((crawled > 64) & ~done, RESULTS.dt_min_reached, result)
         result = self.verdict(c, step, t, y, f, moved, steps, events, done, result)
         active = c.active & ~done & (result == RESULTS.successful)
         return Carry(
@@ -214,6 +226,7 @@ class Flow(eqx.Module):
             events=events,
             halted=halted,
             halvings=step.halvings,
+            crawled=crawled,
             grazed=grazed,
             forked=forked,
             log=log,
@@ -262,6 +275,18 @@ class Flow(eqx.Module):
         result = RESULTS.where(tiny & ended, RESULTS.nonfinite_field, result)
         result = RESULTS.where(tiny & ~ended, RESULTS.dt_min_reached, result)
         return RESULTS.where(c.active, result, c.result)
+
+
+def _backward(step: Step, known: list) -> Bool[Array, ""]:
+    """Whether a guard that has just left a double root seems to fall from there. It rises, but at a loose tolerance its
+    polynomial need not tell."""
+    wrong = jnp.zeros((), bool)
+    for row, noises, counts in zip(step.guards, step.noise, known):
+        for c, noise, roots in zip(row, noises, counts):
+            for r in (2, 3)[: len(c) - 2]:
+                clear = ft.reduce(jnp.maximum, map(jnp.abs, c[r:])) > noise
+                wrong = wrong | ((roots == r) & (c[r] < 0) & clear)
+    return wrong
 
 
 def finite(tree: Any) -> Bool[Array, ""]:

@@ -17,7 +17,7 @@ from ._check import check_solve
 from ._filippov import Model
 from ._jacobian import dense_jacobian
 from ._saltation import _states
-from ._solution import Events, is_okay, Itinerary, RESULTS, Solution
+from ._solution import Events, is_okay, Itinerary, raise_if, RESULTS, Solution
 from ._solve import solve
 from ._system import arrays_of, frozen, relay, sgn, System
 from ._types import Scalar, Y
@@ -323,7 +323,7 @@ def find_orbit(
     if not isinstance(order, int) or order < 1:
         raise ValueError(f"Argument `order` must be a positive integer, but got {order!r}.")
     y0, t0, _, solver, controller, given = check_solve(
-        system, t0, t0, y0, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events
+        system, t0, t0, y0, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events, None
     )
     double = bool(jnp.finfo(t0.dtype).eps < 1e-10)
     if stepsize_controller is None:
@@ -360,5 +360,5 @@ def find_orbit(
             second = _shoot(system, t0, y1, period, **(kwargs | {"mode": None}))
             orbit = second if bool(second.result == RESULTS.successful) else orbit
     if throw:
-        orbit = orbit.result.error_if(orbit, orbit.result != RESULTS.successful)
+        orbit = raise_if(orbit.result != RESULTS.successful, orbit.result, orbit)
     return orbit

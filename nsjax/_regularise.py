@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._check import check_model, check_system
 from ._filippov import Model, State
-from ._system import AbstractSwitch, frozen, sgn, SwitchValues, System
+from ._system import AbstractSwitch, forwarded, frozen, sgn, SwitchValues, System
 from ._types import Scalar, Y
 
 
@@ -30,16 +30,6 @@ _CURVES: dict[str, Callable[[Scalar], Scalar]] = {
 _Values = SwitchValues | Mapping[str, Any]
 
 
-@ft.cache  # switches are told apart by identity
-def _forwarded(switch: AbstractSwitch) -> Any:
-    """The switch for a system that has the switch's own system as its field `system`."""
-
-    def forward(fn: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda self, *args: fn(self.system, *args)
-
-    return switch._with(**{name: forward(part) for name, part in vars(switch).items() if callable(part)})
-
-
 @ft.cache
 def _pulled(switch: sgn) -> sgn:
     """The switch with the indicator function h exp(rate (t - now)). What keeps it constant makes dh/dt = -rate h."""
@@ -48,7 +38,7 @@ def _pulled(switch: sgn) -> sgn:
         growth = jnp.exp(self.rate * (t - self.now))
         return tuple(h * growth for h in switch.components(self.system, t, y))
 
-    return _forwarded(switch)._with(guard=guard)
+    return forwarded(switch)._with(guard=guard)
 
 
 def _field(system: System, t: Scalar, y: Y, friction: _Values, others: _Values) -> Y:
@@ -71,7 +61,7 @@ class _Regularised(System):
 
     @property
     def switches(self) -> tuple[AbstractSwitch, ...]:
-        return tuple(_forwarded(k) for k in self.system.switches if not isinstance(k, sgn))
+        return tuple(forwarded(k) for k in self.system.switches if not isinstance(k, sgn))
 
     @property
     def period(self) -> Float[Array, ""] | float | None:
@@ -196,8 +186,7 @@ def smoothed(system: System, eps: Any, kind: Literal["arctan", "tanh", "linear"]
 
     The solution differs from that of `system` by an error that no tolerance removes: of order 1/ε for "linear", ln(ε)/ε
     for "tanh", and for "arctan", whose tails 1/(ε h) end a stick too early, ε^(-2/3). Derivatives converge too. Where
-    the solution slides the field is stiff, with a rate proportional to ε: use an implicit solver. (`jax.jacfwd` needs
-    its `scan_kind="lax"`.)
+    the solution slides the field is stiff, with a rate proportional to ε: use an implicit solver.
 
     ```python
     sol = nsjax.solve(nsjax.smoothed(system, 1e4), 0.0, 40.0, y0, solver=diffrax.Kvaerno5())

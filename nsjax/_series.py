@@ -185,7 +185,7 @@ class Series:
             a, b = operands
             known = self.product(k, results[0], b, last=k - 1)  # what is left is c_k b_0
             top = _minus(new[0], known)
-            return [None if top is None else once(top / self.term(b, 0))]
+            return [None if top is None else once(top / self.full(self.term(b, 0), e.invars[1]))]
         if name == "select_n":
             if all(c is None for c in new[1:]):
                 return [None]

@@ -28,7 +28,8 @@ def settle(
     """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}, every contact one from {1, 0}.
 
     All of them hold if that is valid (|λ| <= b, a contact force λ >= 0), else as many as can be. Of up to four
-    switches every assignment is tried; if two are equally good the solution is not unique. Of more, the one that
+    switches every assignment is tried; of those that hold as many the one that keeps what held before is taken, and if
+    that is not one alone either, the solution is not unique. Of more, the one that
     violates its law most is released, to the sign of its λ, and a released switch whose motion then opposes this is
     taken back, until nothing is violated.
 
@@ -88,7 +89,8 @@ def settle(
             side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
             trial[k] = jnp.where(at[k], side, mode[k])
     if 1 < len(which) <= _TRIED:
-        trial, wrong = _best(model, t, which, at, came, leaves, trial, look)
+        trial, several, wrong = _best(model, t, which, at, came, leaves, trial, look)
+        forked = forked | several
     elif len(which) == 1:
         trial, wrong = _amend(model, which, at, leaves, trial, look(trial))[0], false
     else:
@@ -114,7 +116,7 @@ def settle(
         begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
         _, trial, wrong = lax.while_loop(unsettled, amend, begin)
 
-    _, rates, slopes = look(trial)
+    s, rates, slopes = look(trial)
     if model.contacts and len(model.holdable) > 1:
         trial = _pinned(model, t, y, state, at, leaves, trial, rates)
     roots = list(state.roots)
@@ -122,13 +124,20 @@ def settle(
     for k in which:
         if k in model.contacts:
             # It lifts off with h = dh/dt = 0, and where its force has reached zero d²h/dt² = 0 too.
-            fresh = jnp.where(trial[k] == 1, 0, jnp.where(leaves[k] != 0, 3, 2))
+            fresh = jnp.where(leaves[k] != 0, 3, 2)
+            edge = jnp.where(s[k] == 0, 1, 0)
         else:
             # Leaving with dh/dt = 0 (the end of sliding with b = 1) makes a double root of h at this instant.
             simple = rates[k] * trial[k].astype(t.dtype) > 1e-10 * jnp.abs(slopes[k])
-            fresh = jnp.where(trial[k] == 0, 0, jnp.where(simple, 1, 2))
+            fresh = jnp.where(simple, 1, 2)
+            edge = jnp.zeros((), jnp.int32)
+            if k in model.holdable:
+                # What begins to be held with λ at its bound need not leave: where λ goes decides.
+                over = jnp.abs(s[k]) >= (1 - _nearly(t)) * model.bound(k)
+                edge = jnp.where(over, jnp.sign(s[k]).astype(jnp.int32), 0)
             unsure = unsure | (at[k] & (trial[k] == 0) & (slopes[k] > 0) & (came[k] == 0))
-        roots[k] = jnp.where(at[k], fresh, roots[k]).astype(jnp.int32)
+        held = model.held(k, trial[k]) if k in model.holdable else False
+        roots[k] = jnp.where(at[k], jnp.where(held, edge, fresh), roots[k]).astype(jnp.int32)
     state = state._replace(mode=tuple(m.astype(jnp.int32) for m in trial.values()), roots=tuple(roots))
     return state, unsure, forked, wrong
 
@@ -149,17 +158,17 @@ def _nearly(like: Scalar) -> float:
 
 def _best(
     model: Model, t: Scalar, which: tuple, at: dict, came: dict, leaves: dict, trial: dict, look: Any
-) -> tuple[dict, Bool[Array, ""]]:
-    """The valid assignment that holds most, of all, and whether it is not the only one."""
+) -> tuple[dict, Bool[Array, ""], Bool[Array, ""]]:
+    """The valid assignment that holds most, of all; whether others hold as many, and whether the choice is open."""
     options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
     table = np.array(list(itertools.product(*options)), np.int32)
 
-    def judge(row: Int[Array, " m"]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+    def judge(row: Int[Array, " m"]) -> tuple[Bool[Array, ""], Int[Array, ""], Int[Array, ""]]:
         mode = dict(trial)
         for i, k in enumerate(which):
             mode[k] = jnp.where(at[k], row[i], trial[k]).astype(jnp.int32)
         s, rates, slopes = look(mode)
-        valid, held = jnp.ones((), bool), jnp.zeros((), jnp.int32)
+        valid, held, kept = jnp.ones((), bool), jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
         for i, k in enumerate(which):
             small = _nearly(t) * jnp.abs(slopes[k])
             if k in model.contacts:
@@ -191,13 +200,17 @@ def _best(
             # A switch that is not at its surface has no choice: its first option stands for what it is.
             valid = valid & jnp.where(at[k], law, row[i] == options[i][0])
             held = held + (at[k] & stays).astype(jnp.int32)
-        return valid, held
+            if k in model.holdable:
+                kept = kept + (at[k] & stays & model.held(k, came[k])).astype(jnp.int32)
+        return valid, held, kept
 
-    valid, held = jax.vmap(judge)(jnp.asarray(table))
-    score = jnp.where(valid, held, -1)
+    valid, held, kept = jax.vmap(judge)(jnp.asarray(table))
+    most = jnp.max(jnp.where(valid, held, -1))
+    several = jnp.sum(valid & (held == most)) > 1
+    score = jnp.where(valid & (held == most), kept, -1)
     best = jnp.argmax(score)
     out = {k: jnp.where(at[k], jnp.asarray(table)[best, i], trial[k]).astype(jnp.int32) for i, k in enumerate(which)}
-    return trial | out, jnp.sum(score == score[best]) != 1
+    return trial | out, several, jnp.sum(score == score[best]) != 1
 
 
 def _pinned(model: Model, t: Scalar, y: Y, state: State, at: dict, leaves: dict, trial: dict, rates: dict) -> dict:

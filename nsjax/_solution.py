@@ -62,6 +62,25 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
+def raise_if(bad: Bool[Array, ""], result: RESULTS, tree: Any) -> Any:
+    """`tree`, if not `bad`, else an error with the message of `result`. Derivatives raise it too: whoever wants these
+    alone computes nothing else, and would be given what belongs to a solution that failed."""
+    smooth, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(_raise_if((smooth, (bad, result))), rest)
+
+
+@eqx.filter_custom_jvp
+def _raise_if(args: Any) -> Any:
+    tree, (bad, result) = args
+    return result.error_if(tree, bad)
+
+
+@_raise_if.def_jvp
+def _raise_if_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    ((tree, verdict),), ((moves, _),) = primals, tangents
+    return _raise_if((tree, verdict)), _raise_if((moves, verdict)) if jax.tree.leaves(moves) else moves
+
+
 def is_okay(result: RESULTS) -> Bool[Array, ""]:
     """Whether a solution reached its end: successfully, or through a tangential event."""
     return (result == RESULTS.successful) | (result == RESULTS.tangential_event)

@@ -18,7 +18,7 @@ from ._flow import Carry, finite, Flow
 from ._forward import forward_only
 from ._jacobian import dense_jacobian
 from ._save import Log, Saved
-from ._solution import Events, is_okay, RESULTS, Solution
+from ._solution import Events, is_okay, raise_if, RESULTS, Solution
 from ._start import start_mode
 from ._structure import is_affine
 from ._system import arrays_of, System
@@ -69,6 +69,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     stepper = make_stepper(solver)
     max_events = max_events if model.slots else 0
     state, forked, result = start_mode(model, start, y0, given)
+    y0 = model.project(start, y0, state)  # a change of y0 off the surface that holds it changes nothing
     f0 = model.flow(start, y0, state)
 
     slots = range(len(model.slots))
@@ -118,6 +119,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         events=zero,
         halted=zero,
         halvings=zero,
+        crawled=zero,
         grazed=jnp.zeros((), bool),
         forked=forked,
         log=Log(max_events, y0, len(model.switches)) if model.slots else None,
@@ -165,7 +167,8 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         dense=None if saved.dense is None else (*saved.dense, direction, c.accepted),
     )
     if throw:
-        sol = result.error_if(sol, ~is_okay(result))
+        # (What is transposed has been computed before.)
+        sol = result.error_if(sol, ~is_okay(result)) if reverse else raise_if(~is_okay(result), result, sol)
     return sol
 
 
@@ -268,7 +271,7 @@ def solve(
     of `RESULTS` occurred, if `throw`.
     """
     y0, t0, t1, solver, controller, given = check_solve(
-        system, t0, t1, y0, mode, solver, stepsize_controller, saveat, max_steps, max_events
+        system, t0, t1, y0, mode, solver, stepsize_controller, saveat, max_steps, max_events, adjoint
     )
     system = arrays_of(system, t0.dtype)
     # Tolerances are numbers too: a new one is no new program.

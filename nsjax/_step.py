@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ._crossing import elevate, nodes, to_bernstein, to_chebyshev
 from ._filippov import Model, State
 from ._once import once
+from ._system import frozen
 from ._types import Scalar, Y
 
 
@@ -72,6 +73,7 @@ class Step(NamedTuple):
     ks: list[Y]  # increments, of which dense output is made
     slope: Y | None = None  # the field at its end, if it is known
     guards: list[list[list[Scalar]]] = []  # `[slot][part][j]`: coefficients of polynomials that stand for the guards
+    noise: list[list[Scalar]] = []  # `[slot][part]`: what rounding of time and state makes of them
     resolved: Bool[Array, ""] | bool = True  # whether they do so well
 
 
@@ -152,8 +154,9 @@ class RungeKutta(Stepper):
         step = self.step(model, state, t, t_next, y, f0)
         if watch is None or not model.slots:
             return step
-        guards, resolved = self.guards(model, state, watch.affine, t, y, step)
-        return step._replace(guards=guards, resolved=resolved)
+        noise = noise_of(model, state, t, y)
+        guards, resolved = self.guards(model, state, watch.affine, t, y, step, noise)
+        return step._replace(guards=guards, noise=noise, resolved=resolved)
 
     def step(self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y) -> Step:
         def f(t: Scalar, y: Y) -> Y:
@@ -205,7 +208,7 @@ class RungeKutta(Stepper):
         return self._weighted(to_bernstein(self.degree) @ self._values(nodes(self.degree)), y, y1, ks)
 
     def guards(
-        self, model: Model, state: State, affine: tuple[bool, ...], t: Scalar, y: Y, step: Step
+        self, model: Model, state: State, affine: tuple[bool, ...], t: Scalar, y: Y, step: Step, noise: list
     ) -> tuple[list[list[list[Scalar]]], Bool[Array, ""]]:
         """Bernstein coefficients `[slot][part][j]` of the guards along a step, and whether they represent them well."""
         out: list[list[list[Scalar]]] = [[] for _ in affine]
@@ -227,16 +230,14 @@ class RungeKutta(Stepper):
             for i, values in sampled([j / n for j in range(n + 1)], self.points(y, step.y1, step.ks), affine):
                 out[i].append(values)
         if not all(affine):
-            n, eps = max(8, self.degree + 3), float(jnp.finfo(t.dtype).eps)
+            n = max(8, self.degree + 3)
             others = tuple(not each for each in affine)
             points = self._weighted(self._values(nodes(n)), y, step.y1, step.ks)
-            points.append(_jittered(y, 64 * eps))
-            for i, (*values, other) in sampled([*map(float, nodes(n)), 0.0], points, others):
+            for i, values in sampled([*map(float, nodes(n))], points, others):
                 v = jnp.stack(values)
                 tail = jnp.max(jnp.abs(jnp.asarray(to_chebyshev(n)[-2:], t.dtype) @ v))
                 # Shortly after a double root or a lift-off all of it is rounding, which a shorter step would not mend.
-                noise = jnp.abs(other - v[0])
-                resolved = resolved & ~(tail > unresolved(t.dtype) * jnp.max(jnp.abs(v)) + noise)
+                resolved = resolved & ~(tail > unresolved(t.dtype) * jnp.max(jnp.abs(v)) + noise[i][len(out[i])])
                 out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ v))
         return out, resolved
 
@@ -246,11 +247,16 @@ def unresolved(dtype: Any) -> float:
     return max(1e-7, 64 * float(jnp.finfo(dtype).eps))
 
 
-def _jittered(y: Y, size: float) -> Y:
-    """The state with every entry changed by the fraction `size`, up or down."""
-    flat, unravel = jfu.ravel_pytree(y)
+def noise_of(model: Model, state: State, t: Scalar, y: Y) -> list[list[Scalar]]:
+    """How much each part of each guard changes with the last digits of time and state (at random up or down), and λ
+    itself by those it is computed with."""
+    flat, unravel = jfu.ravel_pytree(frozen(y))
+    size = 64 * float(jnp.finfo(t.dtype).eps)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], flat.shape)
-    return unravel(flat * jnp.asarray(1 + size * signs, flat.dtype))
+    near = (frozen(t) * (1 + size), unravel(flat * jnp.asarray(1 + size * signs, flat.dtype)))
+    rows = zip(model.slots, model.guards(frozen(t), unravel(flat), state), model.guards(*near, state))
+    own = [size if slot.holding and slot.switch not in model.contacts else 0.0 for slot in model.slots]
+    return [[jnp.abs(a - b) + extra for a, b in zip(here, there)] for (_, here, there), extra in zip(rows, own)]
 
 
 def stack(points: list[Y]) -> Y:

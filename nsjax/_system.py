@@ -7,6 +7,7 @@ method (2.32)).
 
 import abc
 import dataclasses
+import functools as ft
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Self
@@ -28,7 +29,6 @@ class AbstractSwitch:
 
     guard: Guard
     name: str
-    _parts: tuple[str, ...] = ()
 
     def __init__(self, guard: Guard, *, name: str | None = None):
         if not callable(guard):
@@ -143,6 +143,16 @@ class impact(AbstractSwitch):
         return self._with(restitution_fn=fn)
 
 
+@ft.cache  # switches are told apart by identity
+def forwarded(switch: AbstractSwitch) -> Any:
+    """The switch for a system that has the switch's own system as its field `system`."""
+
+    def forward(fn: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda self, *args: fn(self.system, *args)
+
+    return switch._with(**{name: forward(part) for name, part in vars(switch).items() if callable(part)})
+
+
 class SwitchValues:
     """The values `s` handed to `vector_field`: `s.belt`, or `s["belt"]` for a name known only at run time."""
 
@@ -230,6 +240,8 @@ def arrays_of(system: System, dtype: Any) -> System:
 
     for field in dataclasses.fields(system):
         value = getattr(system, field.name)
+        if isinstance(value, System):
+            system = eqx.tree_at(lambda m, n=field.name: getattr(m, n), system, arrays_of(value, dtype))
         if is_float_field(field) and isinstance(value, int) and not isinstance(value, bool):
             system = eqx.tree_at(
                 lambda m, n=field.name: getattr(m, n), system, float(value), is_leaf=lambda x: x is None

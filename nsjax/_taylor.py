@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from ._filippov import Model, State
 from ._series import Coefficient, Series
-from ._step import RungeKutta, Step, Stepper, unresolved, Watch
+from ._step import noise_of, RungeKutta, Step, Stepper, unresolved, Watch
 from ._types import Scalar, Y
 
 
@@ -137,7 +137,7 @@ def _time(t: Scalar, k: int) -> Coefficient:
 def _increments(ys: list[list[Coefficient]], tree: Any, powers: list[Scalar]) -> list[Y]:
     """The terms of the series at the time of which these are the powers, as states."""
     return [
-        jax.tree.unflatten(tree, [jnp.zeros_like(y[0]) if y[i] is None else y[i] * power for y in ys])
+        jax.tree.unflatten(tree, [jnp.zeros_like(y[0]) if (c := y[i]) is None else c * power for y in ys])
         for i, power in enumerate(powers)
         if i
     ]
@@ -205,6 +205,7 @@ class TaylorStepper(Stepper):
         y1 = _sum(y, ks)
         slope = model.flow(t_next, y1, state)
         guards = [[[c * power for c, power in zip(part, powers)] for part in row] for row in columns]
+        noise = noise_of(model, state, t, y) if guards else []
         resolved = jnp.ones((), bool)
         if watch is not None and not all(watch.affine):
             # A kink within the step is seen at its end.
@@ -212,7 +213,7 @@ class TaylorStepper(Stepper):
                 for c, end in zip(row, () if affine else ends):
                     resolved = resolved & (jnp.abs(sum(c[::-1]) - end) <= unresolved(t.dtype) * _size(c))
         last = jax.tree.map(lambda f: (t_next - t) * f, slope)
-        return Step(t_next, y1, _error(ks, last), ks, slope, guards, resolved)
+        return Step(t_next, y1, _error(ks, last), ks, slope, guards, noise, resolved)
 
     def guard_series(
         self, model: Model, state: State, t: Scalar, tree: Any, ys: list[list[Any]], sigma: list[list[Any]]

@@ -52,7 +52,7 @@ def fundamental_matrix(
     if method not in ("variational", "autodiff"):
         raise ValueError(f"Argument `method` must be 'variational' or 'autodiff', but got {method!r}.")
     y0, t0, t1, solver, controller, _ = check_solve(
-        system, t0, t1, y0, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events
+        system, t0, t1, y0, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events, None
     )
     if stepsize_controller is None:
         tol = 1e-10 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-5

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from models import flat, Hammer, itinerary, Motion, pid, times
+from models import flat, Hammer, itinerary, Motion, pid, Point, times
 
+import nsjax
 from nsjax import find_orbit, gallery, RESULTS, solve
 
 
@@ -123,16 +124,41 @@ def test_long_run():
 def test_time_that_cannot_advance():
     """Pitfall 28: at t = 1e8 a unit in the last place of single precision is 8: told, not looped on."""
     sol = solve(single(gallery.StickSlip()), 1e8, 1e8 + 64, single(Motion(2.5, -0.5)), throw=False)
-    assert sol.result in (RESULTS.dt_min_reached, RESULTS.max_steps_reached)
+    assert sol.result == RESULTS.dt_min_reached and sol.stats["num_steps"] < 500
+
+
+class Singular(nsjax.System):
+    """x' = x^p."""
+
+    p: float
+
+    def vector_field(self, t, y, s):
+        return Point(y.x**self.p)
+
+
+@pytest.mark.parametrize("p, end", [(2.0, 1.0), (3.0, 0.5)])
+def test_end_of_a_solution(p, end):
+    """Pitfall 30: where it grows without bound in finite time the steps become as short as the digits of t."""
+    sol = solve(Singular(p), 0.0, 2.0, Point(1.0), throw=False, max_steps=20_000)
+    assert sol.result in (RESULTS.dt_min_reached, RESULTS.nonfinite_field)
+    np.testing.assert_allclose(sol.t1, end, rtol=1e-5)
+    assert sol.stats["num_steps"] < 5000
 
 
 def test_step_that_overflows():
     """Pitfalls 11, 28: after a stick of 1500 the first step is tried with a length of thousands, in which a cubic field
     overflows; it is to be rejected like any other."""
-    system = gallery.ForcedStickSlip(v_dr=1e-3, f_0=0.0)
-    sol = solve(system, 0.0, 4000.0, Motion(0.0, 1e-3), throw=False)
+
+    def run(k, adjoint=dfx.ForwardMode()):
+        system = gallery.ForcedStickSlip(v_dr=1e-3, f_0=0.0, k=k)
+        return solve(system, 0.0, 4000.0, Motion(0.0, 1e-3), throw=False, max_events=64, adjoint=adjoint)
+
+    sol = run(1.0)
     assert sol.result == RESULTS.successful and len(sol.events) >= 2
     np.testing.assert_allclose(times(sol)[0], 1500.0, rtol=1e-6)
+    # What it has been rejected for must not reach the gradient either (pitfall 18).
+    back = jax.grad(lambda k: run(k, dfx.RecursiveCheckpointAdjoint()).y1.x)(1.0)
+    np.testing.assert_allclose(back, jax.jacfwd(lambda k: run(k).y1.x)(1.0), rtol=1e-6)
 
 
 # Units.

@@ -17,8 +17,7 @@ from nsjax import banded, gallery, smoothed, solve
 from nsjax._regularise import Banded
 
 
-# Stiff; and `lax` loops for derivatives in forward mode.
-STIFF = dfx.Kvaerno5(scan_kind="lax")
+STIFF = dfx.Kvaerno5()
 METHODS = {
     "arctan": functools.partial(smoothed, kind="arctan"),
     "tanh": functools.partial(smoothed, kind="tanh"),

@@ -152,7 +152,7 @@ def test_derivatives_and_backwards():
         with mp.workdps(40):
             return reference.floats(reference.simulate(reference.StickSlip(v_dr=p), 20.0, (2.5, -0.5)).y)
 
-    p, h = 0.5, mp.mpf("1e-10")
+    p = 0.5
     np.testing.assert_allclose(end(p), exact(p), atol=1e-12)
     first, second = jax.jacfwd(end)(p), jax.jacfwd(jax.jacfwd(end))(p)
     other = dict(solver=dfx.Dopri8(), stepsize_controller=pid(1e-13))
