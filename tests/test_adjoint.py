@@ -48,6 +48,22 @@ def test_lanes(forward, adjoint):
     assert np.isfinite(gradient).all()
 
 
+def test_lanes_that_have_ended():
+    """Pitfall 18: a lane that has ended goes on with steps of no length, whose NaN must not reach the gradient."""
+
+    def end(x, t1, adjoint):
+        options = dict(solver=dfx.Bosh3(), stepsize_controller=pid(1e-4), max_steps=16, max_events=2)
+        return solve(
+            gallery.SlidingPoint(), 0.0, t1, type(gallery.THESIS["(2.3)"].y0)(x), adjoint=adjoint, **options
+        ).y1.x
+
+    x, t1 = jnp.asarray([2.0, 3.0, 1.0]), jnp.asarray([1e-4, 2.0, 2.0])
+    lanes = jax.vmap(jax.grad(lambda x, t1: end(x, t1, ADJOINTS["checkpoint"]), argnums=(0, 1)))
+    dx, dt = jax.jit(lanes)(x, t1)
+    np.testing.assert_allclose(dx, [1, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(dt, [-1, -1, 0], atol=1e-12)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ADJOINTS)
 def test_impacts_and_saved_states(adjoint):

@@ -148,6 +148,17 @@ def test_ball_on_an_oscillating_table():
     assert resting.sum() > 3 and np.max(np.abs(gap)) < 1e-14
 
 
+def test_ball_on_a_table_late():
+    """Pitfalls 16, 28: after 1e6 time units flights are not taken for short because the time is long."""
+    ref = reference.ball_on_table()
+    t0 = float(2 * np.pi * 159155)
+    sol = solve(TableBall(), t0, t0 + 4.0, Motion(1.7, 0.0), **TIGHT)
+    rest = [e for e in sol.events if e.mode_after["table"] == 1][0]
+    np.testing.assert_allclose(
+        [sol.events.t[0] - t0, rest.t - t0], [float(ref.first_impact), float(ref.accumulation)], atol=1e-8
+    )
+
+
 def test_lift_off_at_a_loose_tolerance():
     """The step to the event drifts by 1e-7 below the table; the flight sets out from the table all the same."""
     sol = solve(TableBall(), 0.0, 9.0, Motion(1.7, 0.0), stepsize_controller=pid(1e-4), solver=dfx.Tsit5())

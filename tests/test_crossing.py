@@ -171,6 +171,21 @@ def test_no_root_missed_and_none_out_of_order(count):
                 assert np.min(abs(t[i][sol.events.switch[i] == k] - root), initial=2) < slack, (i, KINDS[kind[i, k]])
 
 
+@pytest.mark.parametrize("degree", [7, 12])
+def test_steep_polynomial(degree):
+    """Pitfall 8: arctan(50 (r - τ)) as a polynomial of that degree; Newton's method from most places leaves [0, 1]."""
+    place = jax.jit(jax.vmap(lambda c: first_root(c[None])))
+    r = np.linspace(0.02, 0.98, 97)
+    values = np.arctan(50 * (r[:, None] - nodes(degree)))
+    c = values @ to_bernstein(degree).T
+    found, root = place(jnp.asarray(c))
+    assert np.all(found)
+    for ci, u in zip(c, np.asarray(root)):
+        assert abs(evaluate(ci, u)) < 1e-13 * np.abs(ci).max()
+        grid = np.linspace(0, max(u - 1e-6, 0), 500)
+        assert min(evaluate(ci, x) for x in grid) > 0
+
+
 @pytest.mark.parametrize("degree", [2, 6, 9])
 def test_root_next_to_its_mirror_image(degree):
     """δ² - τ² falls to zero at δ; with a small δ a step of Newton's or Halley's method from 0 says nothing."""

@@ -23,6 +23,7 @@ from models import (
     times,
 )
 
+import nsjax
 from nsjax import gallery, RESULTS, solve
 
 
@@ -88,6 +89,71 @@ def test_scale_of_the_indicator_function_does_not_matter():
     assert np.all(sol.result == RESULTS.successful)
     assert np.all(sol.events.num == sol.events.num[0]) and sol.events.num[0] > 3
     np.testing.assert_allclose(flat(sol.y1), np.tile(flat(sol.y1)[:1], (5, 1)), atol=1e-12)
+
+
+def test_scale_does_not_matter_on_the_surface():
+    """Pitfall 27: who starts on the surface, but for an ulp, is on it in every unit of h, and who starts beside it not."""
+    v = 0.2 + jnp.asarray([0.0, np.spacing(0.2), -np.spacing(0.2), 1e-9, -1e-9])
+    scale = 10.0 ** jnp.asarray([0.0, -12.0, 12.0])
+
+    def run(scale, v):
+        sol = solve(Belt(scale=scale), 0.0, 5.0, Motion(0.5, v), throw=False)
+        return sol.mode0[0], jnp.stack(sol.y1), sol.result
+
+    mode, y, result = jax.jit(jax.vmap(jax.vmap(run, (None, 0)), (0, None)))(scale, v)
+    assert np.all(result == RESULTS.successful)
+    np.testing.assert_array_equal(mode, [[0, 0, 0, 1, -1]] * 3)
+    np.testing.assert_allclose(y, np.tile(y[:1], (3, 1, 1)), atol=1e-12)
+
+
+class Ring(Circle):
+    """The circle with h in other units."""
+
+    scale: float = 1.0
+
+    @nsjax.sgn
+    def circle(self, t, y):
+        return self.scale * (y.x**2 + y.y**2 - 1)
+
+
+def test_scale_of_a_surface_that_is_not_affine():
+    """Pitfall 27: a polynomial stands for h to a fraction of h, whatever its unit."""
+    scale = 10.0 ** jnp.asarray([0.0, -12.0, 12.0])
+    sol = jax.jit(jax.vmap(lambda s: solve(Ring(scale=s), 0.0, 3.0, Plane(1.5, 0.0), throw=False)))(scale)
+    assert np.all(sol.result == RESULTS.successful) and np.all(sol.events.num == 1)
+    assert np.all(sol.stats["num_steps"] == sol.stats["num_steps"][0])
+    np.testing.assert_allclose(flat(sol.y1), np.tile(flat(sol.y1)[:1], (3, 1)), atol=1e-12)
+
+
+class Season(nsjax.System):
+    """A field, a surface and a ceiling with a reset, all of which depend on time; `d = -1` runs it backwards."""
+
+    d: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Motion(self.d * y.v, self.d * (jnp.sin(self.d * t) - 0.3 * y.x - 0.5 * s.moving))
+
+    @nsjax.sgn
+    def moving(self, t, y):
+        return y.x - 0.5 * jnp.sin(self.d * t)
+
+    @nsjax.impact
+    def ceiling(self, t, y):
+        return 1.2 + 0.2 * jnp.sin(self.d * t + 0.4) - y.x
+
+    @ceiling.reset
+    def ceiling(self, t, y):  # elastic, so that it is its own inverse
+        return Motion(y.x, 0.4 * jnp.cos(self.d * t + 0.4) - y.v)
+
+
+def test_backwards_in_a_time_that_matters():
+    """Pitfall 33: from 7 to 0 is from -7 to 0 in the system with time reversed, also for what depends on time."""
+    back = solve(Season(), 7.0, 0.0, Motion(0.9, 0.5))
+    same = solve(Season(d=-1.0), -7.0, 0.0, Motion(0.9, 0.5))
+    assert {e.switch for e in same.events} == {"moving", "ceiling"}
+    np.testing.assert_allclose(times(back), -times(same), atol=1e-9)
+    assert itinerary(back) == itinerary(same)
+    np.testing.assert_allclose(flat(back.y1), flat(same.y1), atol=1e-9)
 
 
 def test_support():
@@ -256,32 +322,48 @@ def puck():
     return solve(Bumper(), 0.0, 4.0, Puck(0.0, 1.0, 0.0), stepsize_controller=pid(1e-10))
 
 
-def test_impacts_flip_friction_and_relay(puck):
-    """Pitfalls 12, 35: an impact reverses v, hence friction's sign and the relay, at the same instant."""
+def puck_exactly(t_c):
+    """The state at t = 4 and the events, (name, time), with the clock at t_c."""
     x, v, t, mu = 0.0, 1.0, 0.0, 0.1
     events, motor, on = [], 0.0, 1
     while True:
-        a = -mu * (1.0 if t < 2 else 2.0) * np.sign(v)
-        candidates = [("clock", 2 - t)] if t < 2 else []
+        a = -mu * (1.0 if t < t_c else 2.0) * np.sign(v)
+        candidates = [("clock", t_c - t)] if t < t_c else []
         gap = np.sign(v) - x
         tau = (np.sqrt(v * v + 2 * a * gap) - abs(v)) / a * np.sign(v) if v * v + 2 * a * gap > 0 else np.inf
         candidates += [("wall", tau), ("stop", -v / a), ("end", 4 - t)]
         name, tau = min(candidates, key=lambda c: c[1])
         x, v, t, motor = x + v * tau + a * tau**2 / 2, v + a * tau, t + tau, motor + on * tau
         if name == "end":
-            break
+            return [x, v, motor], events
         events.append((name, t))
         assert name != "stop"
         if name == "wall":
             v = -0.9 * v
             on = 1 if v > 0.5 else 0 if v < -0.5 else on
+
+
+def test_impacts_flip_friction_and_relay(puck):
+    """Pitfalls 12, 35: an impact reverses v, hence friction's sign and the relay, at the same instant."""
     sol = puck
-    np.testing.assert_allclose(flat(sol.y1), [x, v, motor], atol=1e-9)
+    end, events = puck_exactly(2.0)
+    np.testing.assert_allclose(flat(sol.y1), end, atol=1e-9)
     walls = [(e.switch, float(e.t)) for e in sol.events if e.switch in ("left", "right")]
     np.testing.assert_allclose([t for _, t in walls], [t for n, t in events if n == "wall"], atol=1e-9)
     for e in sol.events:
         if e.switch in ("left", "right"):
             assert e.mode_after["rub"] == -e.mode_before["rub"] != 0
+
+
+@pytest.mark.parametrize("t_c", [0.8, 10 - np.sqrt(80)])
+def test_clock_and_wall_in_one_step(t_c):
+    """Pitfall 12: the clock strikes on the step that would meet the wall, shortly before the wall or with it."""
+    sol = solve(Bumper(t_c=t_c), 0.0, 4.0, Puck(0.0, 1.0, 0.0), stepsize_controller=pid(1e-10))
+    end, events = puck_exactly(t_c)
+    assert [e[0] for e in events][:2] == ["clock", "wall"]
+    np.testing.assert_allclose(flat(sol.y1), end, atol=1e-9)
+    clock = [float(e.t) for e in sol.events if e.mode_after["clock"] != e.mode_before["clock"]]
+    np.testing.assert_allclose(clock, [t_c], atol=1e-12)
 
 
 @pytest.mark.parametrize("order", [(4, 3, 2, 1, 0), pytest.param((2, 0, 4, 1, 3), marks=pytest.mark.slow)])

@@ -175,7 +175,7 @@ ARGUMENTS = {
     "class": (
         dict(system=gallery.StickSlip),
         TypeError,
-        r"instance of `nsjax.System`.*Call it: `solve\(Model\(\), ...\)`",
+        r"instance of `nsjax.System`.*Call it, with its parameters: `Model\(...\)`",
     ),
     "no system": (dict(system=lambda t, y: y), TypeError, "must be an instance of `nsjax.System`"),
     "empty": (dict(y0=()), ValueError, "`y0` must hold at least one number, but it is empty"),
@@ -313,6 +313,7 @@ def test_mode_on_the_other_side():
 
 
 def test_limits():
+    """Pitfall 16: a bound on events or steps that is reached is told."""
     run = dict(throw=False, **CHEAP)
     sol = solve(STICK_SLIP, 0.0, 100.0, Motion(2.5, -0.5), max_events=3, **run)
     assert sol.result == RESULTS.max_events_reached and len(sol.events) == 3 and sol.t1 == sol.events.t[2]

@@ -215,7 +215,7 @@ class Stack(nsjax.System):
 
 
 def run_stack(A, p, q, t1):
-    return solve(Stack(*map(jnp.asarray, (A, p, q))), 0.0, t1, Point(jnp.zeros(3)), throw=False)
+    return solve(Stack(*map(jnp.asarray, (A, p, q))), 0.0, t1, Point(jnp.zeros(len(p))), throw=False)
 
 
 def consistent(A, p):
@@ -258,6 +258,32 @@ def test_stack_of_surfaces():
         assert sol.result == RESULTS.successful
         assert slack < 1e-8 or tuple(sol.mode1.tolist()) == exact, (i, A[i], p[i])
     assert harder >= 5
+
+
+def test_stack_of_more_surfaces():
+    """Pitfall 34: of five surfaces not every assignment is tried; where releasing alone gives a wrong mode one is taken
+    back."""
+    rng = np.random.default_rng(5)
+    W = rng.normal(size=(100, 5, 5))
+    A = (W @ W.transpose(0, 2, 1) + 0.1 * np.eye(5)) * rng.uniform(0.3, 3, (100, 1, 5))
+    p = np.einsum("kij,kj->ki", A, rng.uniform(-1.6, 1.6, (100, 5)))
+    cases = [(a, b, consistent(a, b)) for a, b in zip(A, p)]
+    cases = [(a, b, found[0][0]) for a, b, found in cases if len(found) == 1 and found[0][1] > 1e-6]
+    harder = [case for case in cases if greedy(*case[:2]) != case[2]]
+    assert len(harder) >= 5
+    for a, b, exact in harder:
+        sol = run_stack(a, b, np.zeros(5), 1e-3)
+        assert sol.result == RESULTS.successful and tuple(sol.mode1.tolist()) == exact, (a, b)
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e12])
+def test_stack_in_other_units(unit):
+    """Pitfall 27: which of the surfaces are left does not depend on the unit of the state."""
+    A = np.array([[2, 0.5, 0], [0.5, 1.5, 0.3], [0, 0.3, 1]])
+    for p in ([1.0, 0.5, -0.4], [3.0, 0.5, -0.4], [3.0, -2.5, 0.4], [-3.0, 2.5, 2.0]):
+        ((exact, _),) = consistent(A, np.array(p))
+        sol = run_stack(unit * A, unit * np.array(p), np.zeros(3), 1e-3)
+        assert sol.result == RESULTS.successful and tuple(sol.mode1.tolist()) == exact
 
 
 def test_two_surfaces_left_at_one_instant():
@@ -330,6 +356,55 @@ def test_every_restart_is_on_the_surface(a, v, c):
     np.testing.assert_allclose(jacobian[:20], exact, atol=1e-10 * np.abs(exact).max())
     top = a * (flight / 2) ** 2 / 2 * np.sign(v)
     np.testing.assert_allclose(out[-2:], [c + top, 0], atol=1e-11)
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e12])
+def test_restarts_in_other_units(unit):
+    """Pitfall 27: a simple root at the restart is not taken for a double one because h is small."""
+    jacobian, (out, num) = toggle()(unit * jnp.asarray([1.0, 1.0, 0.0]), jnp.asarray(20.5))
+    k = np.arange(1, 11)
+    assert num == 10
+    np.testing.assert_allclose(out[:10], 2 * k, rtol=1e-11)
+    exact = np.stack([-2 * k / unit, 2 * k / unit], -1)
+    np.testing.assert_allclose(jacobian[:10, :2], exact, atol=1e-10 * np.abs(exact).max())
+
+
+class Clock(nsjax.System):
+    """x' = sgn(t - t_c)."""
+
+    t_c: float
+
+    def vector_field(self, t, y, s):
+        return Point(s.clock + 0 * y.x)
+
+    @nsjax.sgn
+    def clock(self, t, y):
+        return t - self.t_c
+
+
+def test_event_on_a_step_boundary():
+    """Pitfall 9: at the very end of a step, or an ulp before or after it, the event comes once, at its time, and its
+    derivative is not lost to the next step."""
+
+    @jax.jit
+    @jax.vmap
+    def run(t_c, dt):
+        def end(t_c):
+            sol = solve(
+                Clock(t_c=t_c), 0.0, 2.0, Point(0.0), max_events=4, throw=False,
+                solver=dfx.Heun(), stepsize_controller=dfx.ConstantStepSize(), dt0=dt,
+            )  # fmt: skip
+            return (sol.y1.x, sol.events.t[0]), (sol.y1.x, sol.events.num)
+
+        return jax.jacfwd(end, has_aux=True)(t_c)
+
+    dt = np.array([0.1, 0.25, 0.3, 1 / 3])
+    t = np.concatenate([np.cumsum(np.full((5, 4), dt), 0) + ulps * 2.0**-52 for ulps in (-1, 0, 1)])
+    (dx, dte), (x, num) = run(jnp.asarray(t.ravel()), jnp.asarray(np.tile(dt, 15)))
+    assert np.all(num == 1)
+    np.testing.assert_allclose(x, 2 - 2 * t.ravel(), atol=1e-14)
+    np.testing.assert_allclose(dx, -2, atol=1e-12)
+    np.testing.assert_allclose(dte, 1, atol=1e-12)
 
 
 def test_end_next_to_an_event():

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import flat, Motion, pid
+from models import Circle, flat, Motion, pid, Plane
 from test_grazing import impact, Touch
 
 from nsjax import gallery, RESULTS, sensitivity, solve
@@ -132,6 +132,22 @@ def test_repulsion_sliding_does_not_drift():
     np.testing.assert_allclose(s.value, [0.5 - 500, 1], rtol=1e-13)
     np.testing.assert_array_equal(s.jacobian, [1, 0])
     assert list(s.itinerary) == [{"surface": 0}]
+
+
+def test_repulsion_sliding_stays():
+    """Pitfall 24: what steps off the surface is put back, on a circle too (it repels backwards in time), and what the
+    start was off it is not in the derivative."""
+
+    y1 = flat(solve(Circle(), 100.0, 0.0, Plane(1.0, 0.0), mode={"circle": 0}).y1)
+    np.testing.assert_allclose(y1, [np.cos(100), -np.sin(100)], atol=1e-6)
+    assert abs(np.hypot(*y1) - 1) < 4e-15
+
+    def end(y0):
+        return flat_jax(solve(gallery.RepulsionSliding(), 0.0, 2.0, PLANE(*y0), mode={"surface": 0}).y1)
+
+    jacobian = jax.jit(jax.jacfwd(end))(jnp.asarray([0.5, 1.0]))
+    np.testing.assert_array_equal(jacobian[:, 0], [1, 0])
+    assert jacobian[1, 1] == 0
 
 
 def flat_jax(y):
