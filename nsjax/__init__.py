@@ -20,3 +20,9 @@ from ._solve import solve as solve
 from ._system import impact as impact, relay as relay, sgn as sgn, System as System
 from ._taylor import Taylor as Taylor
 from ._variational import fundamental_matrix as fundamental_matrix
+from ._work_precision import (
+    Method as Method,
+    methods_for as methods_for,
+    work_precision as work_precision,
+    WorkPrecision as WorkPrecision,
+)

@@ -5,3 +5,4 @@ from ._matrix import fundamental_matrix as fundamental_matrix, multipliers as mu
 from ._path import components as components
 from ._phase import phase_portrait as phase_portrait, poincare_section as poincare_section
 from ._time import time_series as time_series
+from ._work_precision import work_precision as work_precision

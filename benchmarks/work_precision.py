@@ -1,0 +1,121 @@
+"""What accuracy costs, by method, for systems of the thesis: final states and their first derivatives.
+
+    python benchmarks/work_precision.py --out benchmarks/work_precision
+
+Prints a table in Markdown for each, writes all rows to `<out>.json` and the pictures to `<out>_<system>.png`.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+from sweep import machine
+
+import nsjax
+from nsjax import gallery, Method, Taylor
+from nsjax.gallery import Motion
+
+
+class Hammer(nsjax.System):
+    """x'' + 0.02 x' + x = cos ωt with a wall at x = 0.5 and restitution 0.8."""
+
+    omega: float = 2.8
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, jnp.cos(self.omega * t) - 0.02 * y.v - y.x - s.wall)
+
+    @nsjax.impact
+    def wall(self, t, y):
+        return 0.5 - y.x
+
+    @wall.restitution
+    def wall(self):
+        return 0.8
+
+
+class Case(NamedTuple):
+    system: nsjax.System
+    y0: Any
+    t1: float
+    parameter: str  # the derivative is with respect to this one
+
+
+CASES = {
+    "2.4": Case(gallery.thesis("2.4"), Motion(1.1, 0.0), 100.0, "v_dr"),
+    "3.4": Case(gallery.thesis("3.4"), Motion(2.5, -0.5), 100.0, "v_dr"),
+    "6.6": Case(gallery.thesis("6.6"), gallery.entry("6.6").y0, 30.0, "omega"),
+    "6.8": Case(gallery.thesis("6.8"), gallery.entry("6.8").y0, 30.0, "omega"),
+    "hammer": Case(Hammer(), Motion(0.5, -1.0), 30.0, "omega"),
+}
+
+
+def methods(key: str) -> dict[str, Method]:
+    found = {
+        "events, Tsit5": Method(dfx.Tsit5()),
+        "events, Dopri8": Method(dfx.Dopri8()),
+        "events, Taylor": Method(Taylor()),
+    }
+    if key == "2.4":
+        for eps in (1e4, 1e6):
+            found[f"arctan, ε = {eps:.0e}"] = Method(dfx.Kvaerno5(), lambda s, eps=eps: nsjax.smoothed(s, eps))
+    if key in ("2.4", "6.6", "6.8"):
+        found["linear, ε = 1e+06"] = Method(dfx.Kvaerno5(), lambda s: nsjax.smoothed(s, 1e6, "linear"))
+    if key != "hammer":
+        for eta in (1e-4, 1e-6):
+            found[f"band, η = {eta:.0e}"] = Method(dfx.Tsit5(), lambda s, eta=eta: nsjax.banded(s, eta))
+    return found
+
+
+def quantities(case: Case) -> dict[str, Callable[..., Any]]:
+    def state(system: Any, method: Method) -> Any:
+        return method.solve(system, 0.0, case.t1, case.y0).y1
+
+    def derivative(system: Any, method: Method) -> Any:
+        def moved(p: Any) -> Any:
+            return state(eqx.tree_at(lambda s: getattr(s, case.parameter), system, p), method)
+
+        return jax.jacfwd(moved)(jnp.asarray(getattr(system, case.parameter)))
+
+    return {"state": state, "derivative": derivative}
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--systems", nargs="*", default=list(CASES), choices=CASES)
+    parser.add_argument("--tolerances", nargs="*", type=float, default=[1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--count", action="store_true", help="count evaluations of the vector field (slow)")
+    parser.add_argument("--out", help="where to write the numbers and the pictures")
+    args = parser.parse_args()
+    rows: dict[str, Any] = {"machine": machine()}
+    for key in args.systems:
+        case = CASES[key]
+        figure, axes = plt.subplots(1, 2, figsize=(11, 5.2), layout="constrained", sharey=True)
+        for ax, (name, quantity) in zip(axes, quantities(case).items()):
+            chosen = {k: m for k, m in methods(key).items() if name == "state" or "band" not in k}
+            table = nsjax.work_precision(
+                case.system, quantity, chosen, args.tolerances, repeats=args.repeats, max_steps=100_000,
+                count=args.count and name == "state",
+            )  # fmt: skip
+            print(f"\n### {key}, {name} at t = {case.t1:g}\n\n{table}", flush=True)
+            rows[f"{key} {name}"] = dict(doubt=table.doubt, rows=[r._asdict() for r in table.rows])
+            nsjax.plot.work_precision(table, ax=ax)
+            what = name if name == "state" else f"d state / d {case.parameter}"
+            ax.set_xlabel(f"error of {what} at t = {case.t1:g} (largest component)")
+        if args.out:
+            figure.savefig(f"{args.out}_{key}.png", dpi=120)
+        plt.close(figure)
+    if args.out:
+        with open(f"{args.out}.json", "w") as file:
+            json.dump(rows, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()
