@@ -27,8 +27,8 @@ _LINEAR = frozenset(
     "neg add add_any sub broadcast_in_dim reshape squeeze slice transpose concatenate reduce_sum rev copy stack pad "
     "stop_gradient cumsum real imag expand_dims".split()
 )
-# Linear in the first operand, the others being indices.
-_PICKS = frozenset("gather dynamic_slice".split())
+# Linear in the operands that are not indices.
+_PICKS = frozenset("gather dynamic_slice dynamic_update_slice scatter scatter-add scatter_add".split())
 # Steps: their values do not change along a series.
 _STEPS = frozenset("sign floor ceil round eq ne lt le gt ge and or not xor is_finite argmax argmin iota".split())
 
@@ -178,7 +178,11 @@ class Series:
         if name in _LINEAR or name == "convert_element_type":
             return self.linear(e, name, new, bind, len(results))
         if name in _PICKS:
-            return [None if new[0] is None else bind(new[0], *[self.term(i, 0) for i in operands[1:]])]
+            moving = [jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in e.invars]
+            if all(c is None for c, m in zip(new, moving) if m):
+                return [None]
+            pairs = zip(operands, new, moving, e.invars)
+            return [bind(*[self.full(c, v) if m else self.term(i, 0) for i, c, m, v in pairs])]
         if name in ("mul", "dot_general"):
             return [self.product(k, *operands, times=bind)]
         if name == "div":

@@ -39,7 +39,7 @@ class Taylor(dfx.AbstractAdaptiveSolver):
 
     With many terms the steps are long, of the order of the solution's own time scale. Made for smooth fields and for
     tolerances below 1e-6. In `nsjax.solve` events are the roots of the series of h, and the length of a step is known
-    before it is made, from the last coefficients, so that none is rejected.
+    before it is made, from the last coefficients; of a `diffrax.PIDController` only tolerances and `dtmax` matter.
 
     **Arguments:**
 

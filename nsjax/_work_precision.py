@@ -1,5 +1,6 @@
 """What accuracy costs: time against the error that was measured, method by method, for any quantity of any system."""
 
+import logging
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -173,7 +174,7 @@ def work_precision(
         if not isinstance(method, Method):
             raise TypeError(f"Argument `methods` must have a `Method` or a solver for {name!r}, but got {method!r}.")
         method = method._replace(max_steps=max_steps)
-        run = eqx.filter_jit(lambda system, tol, method=method: quantity(system, method._replace(tolerance=tol)))
+        run = jax.jit(lambda system, tol, method=method: quantity(system, method._replace(tolerance=tol)))
         begin = time.perf_counter()
         try:
             compiled = run.lower(system, jnp.asarray(tolerances[0])).compile()
@@ -213,14 +214,20 @@ def _reference(system: System, quantity: Any, max_steps: int) -> tuple[np.ndarra
 def _timed(run: Callable[[], Any], repeats: int) -> tuple[float, Any, str]:
     """Median seconds, the value, and why there is none."""
     seconds, value = [], None
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        try:
+    log = logging.getLogger("jax._src.callback")
+    level, failure = log.level, ""
+    log.setLevel(logging.CRITICAL)  # what fails is told in the table
+    try:
+        jax.block_until_ready(run())
+        for _ in range(repeats):
+            begin = time.perf_counter()
             value = jax.block_until_ready(run())
-        except RuntimeError as problem:  # equinox's errors at run time among them
-            return np.nan, None, _message(problem)
-        seconds.append(time.perf_counter() - begin)
-    return statistics.median(seconds), value, ""
+            seconds.append(time.perf_counter() - begin)
+    except RuntimeError as problem:  # equinox's errors at run time among them
+        failure, value = _message(problem), None
+    finally:
+        log.setLevel(level)
+    return (np.nan if failure else statistics.median(seconds)), value, failure
 
 
 def _message(problem: Exception) -> str:

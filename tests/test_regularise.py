@@ -144,7 +144,7 @@ def _interfaces(n):
     return tuple(interface(i) for i in range(n))
 
 
-@pytest.mark.parametrize("name, b", [("banded", 1.4), ("linear", 1.0)])
+@pytest.mark.parametrize("name, b", [pytest.param("banded", 1.4, marks=pytest.mark.slow), ("linear", 1.0)])
 def test_several_switches(name, b):
     """Three coupled interfaces, forced: they stick alone and in pairs, and a release changes the others' multipliers."""
     plates = Plates(jnp.array([0.4, 0.6, 0.8]), b)
@@ -187,7 +187,7 @@ class Table(nsjax.System):
         return self.e
 
 
-@pytest.mark.parametrize("name, bound", [("banded", 1e-7), ("linear", 1e-3)])
+@pytest.mark.parametrize("name, bound", [pytest.param("banded", 1e-7, marks=pytest.mark.slow), ("linear", 1e-3)])
 def test_contact_beside_friction(name, bound):
     """Impacts, their accumulation and the resting contact remain events; friction is none any more."""
     y0 = Skid(0.5, 0.0, 1.0)

@@ -44,9 +44,10 @@ def work_precision(
         ax.plot(error, [getattr(r, against) for r in line], label=method, **style)
     ax.set_xscale("log")
     ax.set_yscale("log")
+    low, high = ax.get_xlim()
     if table.doubt > 0:
-        ax.axvspan(ax.get_xlim()[0], table.doubt, color="0.9", zorder=0)
-    ax.invert_xaxis()
+        ax.axvspan(low, max(low, table.doubt), color="0.9", zorder=0)
+    ax.set_xlim(high, low)
     ax.set_xlabel(f"error{f' [{unit}]' if unit else ''}")
     ax.set_ylabel("time [s]" if against == "seconds" else "evaluations of the vector field [-]")
     ax.grid(True, which="major", color="0.9")
