@@ -289,7 +289,7 @@ def _reach(ys: list[list[Coefficient]], rtol: Any, atol: Any) -> Scalar:
         if sizes:
             size = ft.reduce(jnp.maximum, sizes)
             log = jnp.minimum(log, jnp.where(size == 0, jnp.inf, -jnp.log(jnp.where(size == 0, 1, size)) / i))
-    return 0.9 * jnp.exp(log)
+    return 0.9 * jnp.exp(jnp.where(jnp.isnan(log), jnp.inf, log))  # a step into what is no number is rejected later
 
 
 def _size(c: list[Scalar]) -> Scalar:

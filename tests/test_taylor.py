@@ -210,6 +210,23 @@ def test_kink_without_a_switch():
     np.testing.assert_allclose(flat(sol.y1), [1.0, 0.0], atol=1e-7)
 
 
+class Root(nsjax.System):
+    """x' = sqrt(c - t): no number beyond t = c, and in no step that a series at t < c stands for."""
+
+    c: float
+
+    def vector_field(self, t, y, s):
+        return Point(jnp.sqrt(self.c - t))
+
+
+@pytest.mark.parametrize("c, results", [(1.0, (RESULTS.dt_min_reached, RESULTS.nonfinite_field)), (-1.0, None)])
+def test_end_of_the_field(c, results):
+    """Pitfall 30: told, and soon; from the start, and on the way."""
+    sol = solve(Root(c), 0.0, 2.0, Point(0.0), solver=Taylor(), throw=False)
+    assert sol.result in (results or (RESULTS.nonfinite_field,)) and sol.stats["num_steps"] < 500
+    np.testing.assert_allclose(sol.t1, max(c, 0.0), atol=1e-9)
+
+
 def test_single_precision():
     y0 = Motion(jnp.float32(2.5), jnp.float32(-0.5))
     system = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), gallery.StickSlip(v_dr=0.5))
