@@ -1,107 +1,161 @@
-"""The sweep S1 by nsjax and by its peers in one run: seconds against the error that was measured.
+"""The workloads S1, S2, S3 (`workloads.py`) by nsjax and by its peers in one run: seconds against the measured error.
 
-    python benchmarks/sweep.py --out benchmarks/sweep.json
+    python benchmarks/sweep.py --workload S1 S2 S3 --out benchmarks/sweep.json
 
-Prints a table in Markdown. Each row is the median of `--repeats` runs, compile time apart; the error is the largest
-component of the final state against the closed form, over all lanes.
+Prints a table in Markdown for each workload. Each row is the median of `--repeats` runs, compile time apart; the error
+is the largest component of what is wanted against the reference, over all lanes.
 """
 
 import argparse
-import functools as ft
 import json
 import os
 import platform
-import statistics
-import time
-from importlib.metadata import version
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-import peers
-from peers import belt_velocities, measure, Measured, reference
+from peers import count_lines, in_chunks, measure, Measured, timed, unpack_checked
+from workloads import F_SLIP, HAMMER, K, SLIDER, T1, WORKLOADS
 
 import nsjax
-from nsjax.gallery import Motion, thesis
+from nsjax.gallery import Motion, StickSlip, thesis
 
 
-def nsjax_lane(v_dr: jax.Array, *, tol: float, solver: diffrax.AbstractSolver) -> tuple[Any, jax.Array, jax.Array]:
-    """What a user of nsjax writes for one lane."""
-    sol = nsjax.solve(
-        thesis("3.4", v_dr=v_dr),
-        0.0,
-        peers.T1,
-        Motion(peers.X0, peers.V0),
-        solver=solver,
-        stepsize_controller=diffrax.PIDController(rtol=tol, atol=tol),
-        max_events=32,
-        throw=False,
-    )
-    return sol.y1, sol.stats["num_events"], sol.stats["num_steps"]
+class Hammer(nsjax.System):
+    """x'' + 0.02 x' + x = cos ωt with a wall at x = 0.5 and restitution 0.8."""
+
+    omega: float = 2.8
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, jnp.cos(self.omega * t) - 0.02 * y.v - y.x - s.wall)
+
+    @nsjax.impact
+    def wall(self, t, y):
+        return 0.5 - y.x
+
+    @wall.restitution
+    def wall(self):
+        return 0.8
+
+
+# What a user of nsjax writes for one lane: the final state or its derivative, and whether it succeeded.
+
+
+def final(system: nsjax.System, y0: Motion, tol: float, solver: diffrax.AbstractSolver) -> tuple[Motion, jax.Array]:
+    controller = diffrax.PIDController(rtol=tol, atol=tol)
+    limits = dict(max_events=32, max_steps=100_000, throw=False)
+    sol = nsjax.solve(system, 0.0, T1, y0, solver=solver, stepsize_controller=controller, **limits)
+    return sol.y1, nsjax.is_okay(sol.result)
+
+
+def slider_lane(v_dr: jax.Array, **options: Any) -> tuple[Motion, jax.Array]:
+    return final(thesis("3.4", v_dr=v_dr), Motion(*SLIDER), **options)
+
+
+def hammer_lane(omega: jax.Array, **options: Any) -> tuple[Motion, jax.Array]:
+    return final(Hammer(omega=omega), Motion(*HAMMER), **options)
+
+
+def derivative_lane(v_dr: jax.Array, **options: Any) -> tuple[jax.Array, jax.Array]:
+    def of(q: jax.Array) -> tuple[jax.Array, jax.Array]:
+        y1, ok = final(thesis("3.4", v_dr=q[2], F_slip=q[3], k=q[4]), Motion(q[0], q[1]), **options)
+        return jnp.stack(y1), ok
+
+    return jax.jacfwd(of, has_aux=True)(jnp.array([*SLIDER, v_dr, F_SLIP, K]))
+
+
+LANES: dict[str, tuple[Callable[..., Any], type]] = {
+    "S1": (slider_lane, StickSlip),
+    "S2": (hammer_lane, Hammer),
+    "S3": (derivative_lane, StickSlip),
+}
 
 
 def measure_nsjax(
-    tol: float, solver: diffrax.AbstractSolver, v_dr: np.ndarray, *, batch: int | None, repeats: int
+    workload: str,
+    tol: float,
+    solver: diffrax.AbstractSolver,
+    values: np.ndarray,
+    *,
+    batch: int | None,
+    repeats: int,
+    expected: np.ndarray,
 ) -> Measured:
-    lanes = jnp.asarray(v_dr)
-    lane = ft.partial(nsjax_lane, tol=tol, solver=solver)
-    sweep = jax.jit(jax.vmap(lane) if batch is None else lambda v: jax.lax.map(lane, v, batch_size=batch))
-    start = time.perf_counter()
-    compiled = sweep.lower(lanes).compile()
-    compile_seconds = time.perf_counter() - start
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        y1, events, steps = jax.block_until_ready(compiled(lanes))
-        seconds.append(time.perf_counter() - start)
-    error = np.abs(np.stack(y1, axis=1) - reference.stick_slip_final(v_dr))
-    assert events.min() >= 8 and events.max() <= 30
-    name = f"nsjax {type(solver).__name__}" + (f"/{batch}" if batch else "")
-    worst, median = float(error.max()), float(np.median(error))
-    return Measured(name, tol, len(v_dr), statistics.median(seconds), compile_seconds, worst, median)
+    lanes = jnp.asarray(values)
+    by_hand, model = LANES[workload]
+
+    def lane(p: jax.Array) -> Any:
+        return by_hand(p, tol=tol, solver=solver)
+
+    def prepare() -> Callable[[], Any]:
+        sweep = jax.jit(jax.vmap(lane) if batch is None else lambda p: jax.lax.map(lane, p, batch_size=batch))
+        compiled = sweep.lower(lanes).compile()
+        return lambda: compiled(lanes)
+
+    name = in_chunks(f"nsjax {type(solver).__name__}", batch)
+    lines = count_lines((model, final, by_hand))
+    options: dict[str, Any] = dict(lines=lines, repeats=repeats, expected=expected)
+    return timed(workload, name, tol, values, prepare, unpack_checked, **options)
+
+
+def measure_all(workload: str, args: argparse.Namespace) -> list[Measured]:
+    values, few = (WORKLOADS[workload].sweep(n) for n in (args.lanes, args.scipy_lanes))
+    expected = WORKLOADS[workload].reference(values)
+    options: dict[str, Any] = dict(workload=workload, expected=expected, repeats=args.repeats)
+    rows = []
+    for tol in args.tol:
+        for batch in [b or None for b in args.batch]:
+            for solver in (diffrax.Tsit5(), diffrax.Dopri8(), nsjax.Taylor()):
+                rows.append(measure_nsjax(tol=tol, solver=solver, values=values, batch=batch, **options))
+            rows.append(measure("diffrax", tol, values, batch_size=batch, **options))
+        for peer in ("heyoka", "heyoka-batch"):
+            rows.append(measure(peer, tol, values, **options))
+    scipy = measure("DOP853", min(args.tol), few, workload=workload, repeats=1)
+    rows.append(scipy._replace(seconds=scipy.seconds * args.lanes / args.scipy_lanes, lanes=args.lanes))
+    return rows
 
 
 def table(rows: list[Measured]) -> str:
-    lines = ["| code | tolerance | seconds | compile [s] | largest error |", "|---|---|---|---|---|"]
+    lines = [
+        "| code | its user's lines | tolerance | seconds | compile [s] | largest error |",
+        "|---|---|---|---|---|---|",
+    ]
     lines += [
-        f"| {r.peer} | {r.tol:.0e} | {r.seconds:.3g} | {r.compile_seconds:.1f} | {r.max_error:.1e} |" for r in rows
+        f"| {r.peer} | {r.lines} | {r.tol:.0e} | {r.seconds:.3g} | {r.compile_seconds:.1f} | {r.max_error:.1e} |"
+        for r in rows
     ]
     return "\n".join(lines)
 
 
 def machine() -> dict[str, Any]:
-    packages = ("jax", "jaxlib", "diffrax", "optimistix", "equinox", "scipy", "numpy")
-    return {
-        "processor": platform.machine(),
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        **{p: version(p) for p in packages},
-    }
+    found = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
+    for package in ("jax", "jaxlib", "diffrax", "optimistix", "equinox", "scipy", "numpy", "heyoka"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:  # heyoka, for those who only import this function
+            continue
+    return found
 
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--workload", nargs="+", default=["S1"], choices=WORKLOADS)
     parser.add_argument("--lanes", type=int, default=4096)
     parser.add_argument("--scipy-lanes", type=int, default=8, help="scipy runs so many; its time is scaled to all")
-    parser.add_argument("--batch", type=int, default=256, help="chunks for nsjax and diffrax")
+    parser.add_argument("--batch", type=int, nargs="+", default=[0, 256], help="chunks of nsjax and diffrax; 0: vmap")
+    parser.add_argument("--tol", type=float, nargs="+", default=[1e-8, 1e-10, 1e-12])
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", help="where to write the numbers as JSON")
     args = parser.parse_args()
-    v_dr = belt_velocities(args.lanes)
     rows = []
-    for tol in (1e-8, 1e-10, 1e-12):
-        for batch in (None, args.batch):
-            for solver in (diffrax.Tsit5(), diffrax.Dopri8()):
-                rows.append(measure_nsjax(tol, solver, v_dr, batch=batch, repeats=args.repeats))
-            rows.append(measure("diffrax", tol, v_dr, repeats=args.repeats, batch_size=batch))
-    rows.append(measure("heyoka", 1e-10, v_dr, repeats=3))
-    few = belt_velocities(args.scipy_lanes)
-    scipy = measure("DOP853", 1e-10, few, repeats=1)
-    rows.append(scipy._replace(seconds=scipy.seconds * args.lanes / args.scipy_lanes, lanes=args.lanes))
-    print(table(rows))
+    for workload in args.workload:
+        rows += (found := measure_all(workload, args))
+        print(f"\n### {workload}, {args.lanes} lanes\n\n{table(found)}", flush=True)
     if args.out:
         with open(args.out, "w") as file:
             json.dump({"machine": machine(), "rows": [r._asdict() for r in rows]}, file, indent=1)

@@ -15,28 +15,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
-from sweep import machine
+from sweep import Hammer, machine
 
 import nsjax
 from nsjax import gallery, Method, Taylor
 from nsjax.gallery import Motion
-
-
-class Hammer(nsjax.System):
-    """x'' + 0.02 x' + x = cos ωt with a wall at x = 0.5 and restitution 0.8."""
-
-    omega: float = 2.8
-
-    def vector_field(self, t, y, s):
-        return Motion(y.v, jnp.cos(self.omega * t) - 0.02 * y.v - y.x - s.wall)
-
-    @nsjax.impact
-    def wall(self, t, y):
-        return 0.5 - y.x
-
-    @wall.restitution
-    def wall(self):
-        return 0.8
 
 
 class Case(NamedTuple):
