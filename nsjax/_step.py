@@ -14,6 +14,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
+import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -154,9 +155,7 @@ class RungeKutta(Stepper):
         step = self.step(model, state, t, t_next, y, f0)
         if watch is None or not model.slots:
             return step
-        noise = noise_of(model, state, t, y)
-        guards, resolved = self.guards(model, state, watch.affine, t, y, step, noise)
-        return step._replace(guards=guards, noise=noise, resolved=resolved)
+        return self.watched(model, state, watch.affine, t, y, step)
 
     def step(self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y) -> Step:
         def f(t: Scalar, y: Y) -> Y:
@@ -207,10 +206,10 @@ class RungeKutta(Stepper):
     def points(self, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
         return self._weighted(to_bernstein(self.degree) @ self._values(nodes(self.degree)), y, y1, ks)
 
-    def guards(
-        self, model: Model, state: State, affine: tuple[bool, ...], t: Scalar, y: Y, step: Step, noise: list
-    ) -> tuple[list[list[list[Scalar]]], Bool[Array, ""]]:
-        """Bernstein coefficients `[slot][part][j]` of the guards along a step, and whether they represent them well."""
+    def watched(self, model: Model, state: State, affine: tuple[bool, ...], t: Scalar, y: Y, step: Step) -> Step:
+        """A step with Bernstein coefficients `[slot][part][j]` of the guards along it."""
+        near = jittered(model, state, t, y)
+        noise: list[list[Scalar]] = [[] for _ in affine]
         out: list[list[list[Scalar]]] = [[] for _ in affine]
         resolved = jnp.ones((), bool)
         dt = step.t_next - t
@@ -228,6 +227,7 @@ class RungeKutta(Stepper):
         if any(affine):
             n = self.degree
             for i, values in sampled([j / n for j in range(n + 1)], self.points(y, step.y1, step.ks), affine):
+                noise[i].append(jnp.abs(near[i][len(out[i])] - values[0]))
                 out[i].append(values)
         if not all(affine):
             n = max(8, self.degree + 3)
@@ -237,9 +237,10 @@ class RungeKutta(Stepper):
                 v = jnp.stack(values)
                 tail = jnp.max(jnp.abs(jnp.asarray(to_chebyshev(n)[-2:], t.dtype) @ v))
                 # Shortly after a double root or a lift-off all of it is rounding, which a shorter step would not mend.
-                resolved = resolved & ~(tail > unresolved(t.dtype) * jnp.max(jnp.abs(v)) + noise[i][len(out[i])])
+                noise[i].append(jnp.abs(near[i][len(out[i])] - values[0]))
+                resolved = resolved & ~(tail > unresolved(t.dtype) * jnp.max(jnp.abs(v)) + noise[i][-1])
                 out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ v))
-        return out, resolved
+        return step._replace(guards=out, noise=lax.stop_gradient(with_multipliers(model, noise)), resolved=resolved)
 
 
 def unresolved(dtype: Any) -> float:
@@ -247,16 +248,18 @@ def unresolved(dtype: Any) -> float:
     return max(1e-7, 64 * float(jnp.finfo(dtype).eps))
 
 
-def noise_of(model: Model, state: State, t: Scalar, y: Y) -> list[list[Scalar]]:
-    """How much each part of each guard changes with the last digits of time and state (at random up or down), and λ
-    itself by those it is computed with."""
+def jittered(model: Model, state: State, t: Scalar, y: Y) -> list[list[Scalar]]:
+    """The guards with the last digits of time and state changed, each up or down: what differs is rounding."""
     flat, unravel = jfu.ravel_pytree(frozen(y))
     size = 64 * float(jnp.finfo(t.dtype).eps)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], flat.shape)
-    near = (frozen(t) * (1 + size), unravel(flat * jnp.asarray(1 + size * signs, flat.dtype)))
-    rows = zip(model.slots, model.guards(frozen(t), unravel(flat), state), model.guards(*near, state))
-    own = [size if slot.holding and slot.switch not in model.contacts else 0.0 for slot in model.slots]
-    return [[jnp.abs(a - b) + extra for a, b in zip(here, there)] for (_, here, there), extra in zip(rows, own)]
+    return model.guards(frozen(t) * (1 + size), unravel(flat * jnp.asarray(1 + size * signs, flat.dtype)), state)
+
+
+def with_multipliers(model: Model, noise: list[list[Scalar]]) -> list[list[Scalar]]:
+    """The rounding of the guards, with that of the digits λ itself is computed with."""
+    own = [slot.holding and slot.switch not in model.contacts for slot in model.slots]
+    return [[x + 64 * jnp.finfo(x.dtype).eps if o else x for x in row] for row, o in zip(noise, own)]
 
 
 def stack(points: list[Y]) -> Y:

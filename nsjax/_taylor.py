@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from ._filippov import Model, State
 from ._series import Coefficient, Series
-from ._step import noise_of, RungeKutta, Step, Stepper, unresolved, Watch
+from ._step import jittered, RungeKutta, Step, Stepper, unresolved, Watch, with_multipliers
 from ._types import Scalar, Y
 
 
@@ -205,7 +205,8 @@ class TaylorStepper(Stepper):
         y1 = _sum(y, ks)
         slope = model.flow(t_next, y1, state)
         guards = [[[c * power for c, power in zip(part, powers)] for part in row] for row in columns]
-        noise = noise_of(model, state, t, y) if guards else []
+        near = jittered(model, state, t, y) if guards else []
+        noise = [[jnp.abs(n - c[0]) for n, c in zip(*rows)] for rows in zip(near, guards)]
         resolved = jnp.ones((), bool)
         if watch is not None and not all(watch.affine):
             # A kink within the step is seen at its end.
@@ -213,7 +214,7 @@ class TaylorStepper(Stepper):
                 for c, end in zip(row, () if affine else ends):
                     resolved = resolved & (jnp.abs(sum(c[::-1]) - end) <= unresolved(t.dtype) * _size(c))
         last = jax.tree.map(lambda f: (t_next - t) * f, slope)
-        return Step(t_next, y1, _error(ks, last), ks, slope, guards, noise, resolved)
+        return Step(t_next, y1, _error(ks, last), ks, slope, guards, with_multipliers(model, noise), resolved)
 
     def guard_series(
         self, model: Model, state: State, t: Scalar, tree: Any, ys: list[list[Any]], sigma: list[list[Any]]

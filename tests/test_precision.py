@@ -67,11 +67,16 @@ def test_jax_as_it_comes():
     with jax.enable_x64(False):
         sol = solve(gallery.StickSlip(), 0.0, 20.0, Motion(2.5, -0.5))
         slope = jax.jacfwd(lambda v: solve(gallery.StickSlip(v_dr=v), 0.0, 20.0, Motion(2.5, -0.5)).y1.x)(0.2)
-        orbit = find_orbit(gallery.StickSlip(), Motion(2.5, -0.5), period=12.0)
     np.testing.assert_allclose(times(sol), [float(e.t) for e in exact.events], atol=1e-3)
     np.testing.assert_allclose(flat(sol.y1), reference.floats(exact.y), atol=1e-3)
     double = jax.jacfwd(lambda v: solve(gallery.StickSlip(v_dr=v), 0.0, 20.0, Motion(2.5, -0.5)).y1.x)(0.2)
     np.testing.assert_allclose(slope, double, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_orbit_with_jax_as_it_comes():
+    with jax.enable_x64(False):
+        orbit = find_orbit(gallery.StickSlip(), Motion(2.5, -0.5), period=12.0)
     np.testing.assert_allclose(orbit.period, reference.stick_slip_period(0.2), rtol=1e-4)
 
 
@@ -145,20 +150,24 @@ def test_end_of_a_solution(p, end):
     assert sol.stats["num_steps"] < 5000
 
 
+def long_stick(k, adjoint=dfx.ForwardMode()):
+    system = gallery.ForcedStickSlip(v_dr=1e-3, f_0=0.0, k=k)
+    return solve(system, 0.0, 4000.0, Motion(0.0, 1e-3), throw=False, max_events=64, adjoint=adjoint)
+
+
 def test_step_that_overflows():
     """Pitfalls 11, 28: after a stick of 1500 the first step is tried with a length of thousands, in which a cubic field
     overflows; it is to be rejected like any other."""
-
-    def run(k, adjoint=dfx.ForwardMode()):
-        system = gallery.ForcedStickSlip(v_dr=1e-3, f_0=0.0, k=k)
-        return solve(system, 0.0, 4000.0, Motion(0.0, 1e-3), throw=False, max_events=64, adjoint=adjoint)
-
-    sol = run(1.0)
+    sol = long_stick(1.0)
     assert sol.result == RESULTS.successful and len(sol.events) >= 2
     np.testing.assert_allclose(times(sol)[0], 1500.0, rtol=1e-6)
-    # What it has been rejected for must not reach the gradient either (pitfall 18).
-    back = jax.grad(lambda k: run(k, dfx.RecursiveCheckpointAdjoint()).y1.x)(1.0)
-    np.testing.assert_allclose(back, jax.jacfwd(lambda k: run(k).y1.x)(1.0), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_gradient_after_a_step_that_overflows():
+    """Pitfall 18: what it has been rejected for does not reach the gradient."""
+    back = jax.grad(lambda k: long_stick(k, dfx.RecursiveCheckpointAdjoint()).y1.x)(1.0)
+    np.testing.assert_allclose(back, jax.jacfwd(lambda k: long_stick(k).y1.x)(1.0), rtol=1e-6)
 
 
 # Units.

@@ -42,7 +42,13 @@ def error(sol, truth):
     return np.abs(flat(sol.y1) - flat(truth.y1)).reshape(-1, flat(truth.y1).size).max(-1)
 
 
-@pytest.mark.parametrize("name, order", [("arctan", 0.6), ("tanh", 0.9), ("linear", 1), ("banded", 1)])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "name, order",
+    [pytest.param("arctan", 0.6, marks=SLOW), pytest.param("tanh", 0.9, marks=SLOW), ("linear", 1), ("banded", 1)],
+)
 def test_order_on_falling_friction(name, order):
     """Section 2.4. First order, but for the tails of the arctangent: where a stick ends with h ~ t² they pull the
     solution off a time of order ε^(-1/3) too early, which makes the order 2/3."""
@@ -144,7 +150,7 @@ def _interfaces(n):
     return tuple(interface(i) for i in range(n))
 
 
-@pytest.mark.parametrize("name, b", [pytest.param("banded", 1.4, marks=pytest.mark.slow), ("linear", 1.0)])
+@pytest.mark.parametrize("name, b", [pytest.param("banded", 1.4, marks=SLOW), ("linear", 1.0)])
 def test_several_switches(name, b):
     """Three coupled interfaces, forced: they stick alone and in pairs, and a release changes the others' multipliers."""
     plates = Plates(jnp.array([0.4, 0.6, 0.8]), b)
@@ -187,7 +193,7 @@ class Table(nsjax.System):
         return self.e
 
 
-@pytest.mark.parametrize("name, bound", [pytest.param("banded", 1e-7, marks=pytest.mark.slow), ("linear", 1e-3)])
+@pytest.mark.parametrize("name, bound", [pytest.param("banded", 1e-7, marks=SLOW), ("linear", 1e-3)])
 def test_contact_beside_friction(name, bound):
     """Impacts, their accumulation and the resting contact remain events; friction is none any more."""
     y0 = Skid(0.5, 0.0, 1.0)
