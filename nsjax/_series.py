@@ -2,7 +2,8 @@
 
 The coefficients are found one order at a time, so that a differential equation's own series can be fed back, and each
 is computed once. (`jax.experimental.jet` computes all orders of a given input anew each time, zeros included: programs
-of 3,600 equations instead of 300 for a forced oscillator at order 16, and it knows neither arctan nor linear solves.)
+of 3,600 equations instead of 1,100 for the forced friction of section 6.8 at order 16, of 15,700 instead of 3,500 for
+that of 2.4; and it does not know arctan.)
 """
 
 import functools as ft
