@@ -272,9 +272,9 @@ def land(
         if k in model.contacts:
             # Another impact may set a resting contact in motion: it lifts off, or is hit at once.
             level = model.level(k, te, jumped, state_after)
-            (noise,) = model.rounding(lambda t, y, k=k: (model.level(k, t, y, state_after),), te, jumped)
+            (slack,) = model.rounding(lambda t, y, k=k: (model.level(k, t, y, state_after),), te, jumped)
             moved = level != model.level(k, te, before, state_after)
-            moved = moved & (state.mode[k] == 1) & (jnp.abs(level) > 1e3 * noise)
+            moved = moved & (state.mode[k] == 1) & (jnp.abs(level) > 1e3 * slack)
             modes[k] = jnp.where(moved, 0, modes[k])
             roots[k] = jnp.where(moved, (level > 0).astype(jnp.int32), roots[k])
             at[k] = ends | ((state.mode[k] == 1) & ~moved)

@@ -1,6 +1,7 @@
 """Friction at its bound: at the start, at the end, at a loose tolerance, and where it may break at several places."""
 
 import functools
+from typing import ClassVar
 
 import diffrax as dfx
 import jax
@@ -129,27 +130,24 @@ class Loaded(nsjax.System):
     """A system in which another one is a part."""
 
     inner: gallery.StickSlip
-    load: float = 0.0
+    traced: ClassVar[int] = 0
 
     def vector_field(self, t, y, s):
-        f = self.inner.vector_field(t, y, s)
-        return Motion(f.x, f.v - self.load)
+        Loaded.traced += 1
+        return self.inner.vector_field(t, y, s)
 
     @property
     def switches(self):
         return (nsjax.sgn(_belt, name="belt"),)
-
-    def values(self, s):
-        return self.inner.values(s)
 
 
 def _belt(system, t, y):
     return y.v - system.inner.v_dr
 
 
-def test_integers_among_the_numbers_of_a_part(caplog):
+def test_integers_among_the_numbers_of_a_part():
     """Pitfall 31: whole numbers do not become constants of the program."""
-    with jax.log_compiles():
-        for k in (1, 2, 3):
-            solve(Loaded(gallery.StickSlip(k=k)), 0.0, 1.0, Motion(2.5, -0.5))
-    assert sum("Compiling" in r.message and "_run" in r.message for r in caplog.records) <= 1
+    solve(Loaded(gallery.StickSlip(k=1)), 0.0, 1.0, Motion(2.5, -0.5))
+    first = Loaded.traced
+    solve(Loaded(gallery.StickSlip(k=2)), 0.0, 1.0, Motion(2.5, -0.5))
+    assert Loaded.traced == first > 0
