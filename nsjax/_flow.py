@@ -116,9 +116,8 @@ class Flow(eqx.Module):
             busy = c.active & keep & is_finite & ~quiet & (t_next - c.t > 4 * eps * jnp.abs(c.t))
         if self.reverse:
             # The derivatives of a rejected step that overflows are no numbers, and zero times that is none either.
-            still = step._replace(t_next=jnp.where(keep, t_next, c.t))
-            again = stepper(model, c.state, c.t, still.t_next, c.y, c.f)
-            step = still._replace(y1=again.y1, ks=again.ks, slope=again.slope)
+            again = stepper(model, c.state, c.t, jnp.where(keep, t_next, c.t), c.y, c.f)
+            step = step._replace(t_next=again.t_next, y1=again.y1, ks=again.ks, slope=again.slope)
         return _Attempt(step, keep & c.active, dt, halvings, controller, result, busy)
 
     def pace(self, c: Carry, step: Step) -> tuple[Any, Any, PyTree, Any]:

@@ -252,7 +252,8 @@ def solve(
         (also on a repulsive surface); `relay` 0 or 1 (needed between its two surfaces, 0 by default); `impact` 0 or 1
         to rest. Where the solution is not unique this chooses one; without it static friction holds as long as it can,
         a repulsive surface that is reached is crossed, and a start on one is refused. `Solution.unique` tells.
-    - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, or Euler.
+    - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, Euler, or
+        `nsjax.Taylor`.
     - `stepsize_controller`: by default `diffrax.PIDController` with `rtol = atol = 1e-8` (1e-5 for float32).
     - `saveat`: as in diffrax: `t0`, `t1`, `ts`, `steps`, `fn(t, y, system)`, `dense`.
     - `dt0`: first step; chosen automatically by default.
