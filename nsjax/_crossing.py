@@ -20,15 +20,16 @@ UNROLLED = 3  # steps of Halley's method on a root before a loop takes over
 DEPTH = 40  # bisections: closer roots than 2**-40 of a step are one (2**-30 where jax has no 64-bit integers)
 
 
-def nodes(degree: int) -> np.ndarray:
-    """Chebyshev-Lobatto nodes on [0, 1], ends included."""
-    return 0.5 - 0.5 * np.cos(np.pi * np.arange(degree + 1) / max(degree, 1))
+def nodes(degree: int, even: bool = False) -> np.ndarray:
+    """Chebyshev-Lobatto nodes on [0, 1], or equally spaced ones, ends included."""
+    j = np.arange(degree + 1) / max(degree, 1)
+    return j if even else 0.5 - 0.5 * np.cos(np.pi * j)
 
 
 @ft.lru_cache
-def to_bernstein(degree: int) -> np.ndarray:
-    """Matrix from values at `nodes(degree)` to Bernstein coefficients."""
-    x = nodes(degree)[:, None]
+def to_bernstein(degree: int, even: bool = False) -> np.ndarray:
+    """Matrix from values at `nodes(degree, even)` to Bernstein coefficients."""
+    x = nodes(degree, even)[:, None]
     j = np.arange(degree + 1)
     binomial = np.array([math.comb(degree, int(i)) for i in j])
     matrix = np.linalg.inv(binomial * x**j * (1 - x) ** (degree - j))
@@ -37,57 +38,61 @@ def to_bernstein(degree: int) -> np.ndarray:
 
 
 @ft.lru_cache
-def to_chebyshev(degree: int) -> np.ndarray:
-    """Matrix from values at `nodes(degree)` to Chebyshev coefficients, whose last ones tell the resolution."""
-    return np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * nodes(degree) - 1, degree))
+def to_chebyshev(degree: int, even: bool = False) -> np.ndarray:
+    """Matrix from values at `nodes(degree, even)` to Chebyshev coefficients, whose last ones tell the resolution."""
+    return np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * nodes(degree, even) - 1, degree))
 
 
-def deflate(c: Float[Array, "... coefficients"], roots: Int[Array, "..."]) -> Float[Array, "... coefficients"]:
-    """Divides by τ up to three times (`roots` of them), keeping the degree: takes out known roots at τ = 0."""
-    n = c.shape[-1] - 1
-    j = np.arange(n + 1)
+# Below a polynomial is the list of its coefficients a_j in Σ a_j u^j (1 - u)^(n - j), its Bernstein coefficients times
+# the binomials: they have the same signs, dividing by u shifts them, and Horner's scheme in u / (1 - u) evaluates them.
+# A list, since XLA's CPU code for arrays whose last axis counts coefficients is not vectorised over lanes.
 
-    def divided(c: Array) -> Array:
-        # τ B_{j-1}^{n-1} = (j/n) B_j^n, so q = c_j n/j of degree n-1; then elevated to degree n.
-        q = c[..., 1:] * jnp.asarray(n / j[1:], c.dtype)
-        lower = jnp.concatenate([q[..., :1], q], axis=-1)
-        upper = jnp.concatenate([q, q[..., -1:]], axis=-1)
-        up = jnp.asarray(j / n, c.dtype)
-        return up * lower + (1 - up) * upper
 
-    first = divided(c)
-    second = divided(first)
-    roots = roots[..., None]
-    # Dividing twice a polynomial of degree n = 1 leaves only the slope, which is what dividing it again gives.
+def binomials(n: int) -> list[float]:
+    return [float(math.comb(n, j)) for j in range(n + 1)]
+
+
+def _divided(a: list[Array]) -> list[Array]:
+    """Divided by u, and raised to the same degree again."""
+    return [a[1], *[x + y for x, y in zip(a[2:], a[1:-1])], a[-1]]
+
+
+def deflate(a: list[Array], roots: Int[Array, "..."]) -> list[Array]:
+    """Divides by u up to three times (`roots` of them), keeping the degree: takes out known roots at u = 0."""
+    first = _divided(a)
+    second = _divided(first)
     # A second root within rounding of the first cannot be told from a double one.
-    double = jnp.abs(first[..., :1]) <= 1e-10 * jnp.max(jnp.abs(first), axis=-1, keepdims=True)
-    many = jnp.where(roots == 3, divided(second), second)
-    return jnp.where(roots == 0, c, jnp.where((roots == 1) & ~double, first, many))
+    double = jnp.abs(first[0]) <= 1e-10 * once(largest(first))
+    third = roots == 3
+    many = [jnp.where(third, x, y) for x, y in zip(_divided(second), second)]
+    none, simple = roots == 0, (roots == 1) & ~double
+    return once([jnp.where(none, x, jnp.where(simple, y, z)) for x, y, z in zip(a, first, many)])
 
 
-@ft.lru_cache
-def elevate(degree: int, to: int) -> np.ndarray:
-    """Matrix that raises the degree of a polynomial in Bernstein form."""
-    matrix = np.eye(degree + 1)
-    for n in range(degree + 1, to + 1):
-        j = np.arange(n + 1)[:, None] / n
-        padded = np.zeros((n + 2, degree + 1))
-        padded[1:-1] = matrix
-        matrix = j * padded[:-1] + (1 - j) * padded[1:]
-    return matrix
+def largest(a: list[Array]) -> Array:
+    """The largest absolute value among the Bernstein coefficients, a bound of the polynomial on [0, 1]."""
+    return ft.reduce(jnp.maximum, [jnp.abs(x) / w for x, w in zip(a, binomials(len(a) - 1))])
 
 
-def bend(c: Float[Array, " coefficients"], u: Scalar) -> Scalar:
+def _horner(a: list[Array], x: Array) -> Array:
+    return ft.reduce(lambda value, c: value * x + c, a[::-1])
+
+
+def bend(a: list[Array], u: Scalar) -> Scalar:
     """The second derivative at `u` (which may be a little outside of [0, 1]), up to a positive factor."""
-    c = c[2:] - 2 * c[1:-1] + c[:-2]
-    while c.shape[0] > 1:
-        c = (1 - u) * c[:-1] + u * c[1:]
-    return c[0] if c.shape[0] else jnp.zeros_like(u)
+    n = len(a) - 1
+    if n < 2:
+        return jnp.zeros_like(u)
+    c = [x / w for x, w in zip(a, binomials(n))]
+    c = [w * (z - 2 * y + x) for w, x, y, z in zip(binomials(n - 2), c, c[1:], c[2:])]
+    early = u < 0.5
+    c = [jnp.where(early, x, y) for x, y in zip(c, c[::-1])]
+    return _horner(c, jnp.where(early, u, 1 - u) / jnp.where(early, 1 - u, u))
 
 
-def no_root(c: Float[Array, "... parts coefficients"]) -> Bool[Array, "..."]:
-    """Whether the maximum over the parts is certainly positive on the whole step."""
-    return jnp.any(jnp.all(c > 0, axis=-1), axis=-1)
+def no_root(a: list[Array]) -> Bool[Array, "..."]:
+    """Whether the maximum over the parts (the last axis) is certainly positive on the whole step."""
+    return jnp.any(ft.reduce(jnp.minimum, a) > 0, axis=-1)
 
 
 def _restrict(c: Float[Array, "parts coefficients"], a: Scalar, b: Scalar) -> Float[Array, "parts coefficients"]:
@@ -105,24 +110,25 @@ def _restrict(c: Float[Array, "parts coefficients"], a: Scalar, b: Scalar) -> Fl
     return left(head[..., ::-1], 1 - a / b)[..., ::-1]
 
 
-def _polish(c: Float[Array, " coefficients"]) -> Scalar:
-    """The one root on [0, 1] of a polynomial with c[0] > 0 >= c[-1]: Halley's method kept inside the bracket.
+def _polish(a: list[Scalar], wanted: Bool[Array, ""]) -> Scalar:
+    """The one root on [0, 1] of a polynomial with a[0] > 0 >= a[-1], if it is `wanted`: Halley's method in u, or from
+    the other end in 1 - u, kept inside the bracket [0, 1/2].
 
     The first steps are unrolled, being all that most roots need; for the others a loop goes on.
     """
-    n = c.shape[-1] - 1
-    differences = [c[j] for j in range(n + 1)]
-    powers = []
-    for j in range(n + 1):
-        powers.append(once(math.comb(n, j) * differences[0]))
-        differences = [b - a for a, b in zip(differences[:-1], differences[1:])]
-    eps = jnp.finfo(c.dtype).eps
+    late = once(sum(a[1:], a[0])) > 0
+    a = [once(jnp.where(late, -y, x)) for x, y in zip(a, a[::-1])]
+    n, eps = len(a) - 1, jnp.finfo(a[0].dtype).eps
 
     def improve(state: tuple) -> tuple:
         low, high, u, done, count = state
-        value = slope = bend = jnp.zeros_like(u)  # with half the second derivative
-        for a in reversed(powers):
-            value, slope, bend = value * u + a, slope * u + value, bend * u + slope
+        w = 1 / (1 - u)
+        x = u * w
+        value = slope = bend = jnp.zeros_like(u)  # by x, with half the second derivative
+        for c in reversed(a):
+            value, slope, bend = value * x + c, slope * x + value, bend * x + slope
+        # The same by u, up to the factor w^n.
+        slope, bend = w * (w * slope - n * value), w * w * (w * w * bend - (n - 1) * (w * slope - 0.5 * n * value))
         low = jnp.where(value > 0, u, low)
         high = jnp.where(value > 0, high, u)
         newton = value / slope
@@ -136,8 +142,10 @@ def _polish(c: Float[Array, " coefficients"]) -> Scalar:
         trusted = inside & (ratio <= 0.5) & ((count % 3 != 2) | (step < 1e-2))
         exact = (value == 0) & (slope < 0)
         new = jnp.where(done | exact, u, jnp.where(trusted, guess, 0.5 * (low + high)))
-        # The error that is left is the step times the square of the ratio.
-        done = done | exact | (trusted & (ratio * ratio * step <= eps)) | (high - low <= 4 * eps)
+        # The error that is left is the step times the square of the ratio, and where the curvature vanishes times that
+        # of the step, by the third derivative.
+        rest = (ratio * ratio + (n * step) ** 2) * step
+        done = done | exact | (trusted & (rest <= eps)) | (high - low <= 4 * eps)
         return low, high, once(new), done, count + 1
 
     def busy(state: tuple) -> Bool[Array, ""]:
@@ -145,37 +153,35 @@ def _polish(c: Float[Array, " coefficients"]) -> Scalar:
         return ~done & (count < 100)
 
     # A root at the very end is no place to start: an earlier one may be meant, and there the sign is rounding.
-    secant = c[0] / (c[0] - c[-1])
-    guess = once(jnp.where(secant < 0.99, secant, 0.5))
-    state = (jnp.zeros_like(guess), jnp.ones_like(guess), guess, jnp.zeros((), bool), jnp.zeros((), jnp.int32))
+    secant = 0.5 * a[0] / (a[0] - 0.5**n * sum(a[1:], a[0]))
+    guess = once(jnp.where(secant > 0.005, secant, 0.25))
+    state = (jnp.zeros_like(guess), jnp.full_like(guess, 0.5), guess, ~wanted, jnp.zeros((), jnp.int32))
     for _ in range(UNROLLED):
         state = improve(state)
-    return jax.lax.while_loop(busy, improve, state)[2]
+    u = jax.lax.while_loop(busy, improve, state)[2]
+    return jnp.where(late, 1 - u, u)
 
 
-def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], Scalar]:
-    """The earliest τ in [0, 1] at which the maximum of the polynomials over the parts is no longer positive.
+def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar]:
+    """The earliest u in [0, 1] at which the maximum of the polynomials over the parts is no longer positive.
 
     Walks through dyadic intervals from the left: one without a root is passed, one with exactly one is done, any other
     is halved. A root that so many halvings do not separate from its neighbour (a double root) is reported where it is.
 
-    **Arguments:**
-
-    - `c`: Bernstein coefficients on the step.
-
     **Returns:** whether there is one, and its place (1 if there is none).
     """
-    one, zero = jnp.ones((), c.dtype), jnp.zeros((), jnp.result_type(int))
+    n, dtype = len(a) - 1, a[0].dtype
+    one, zero = jnp.ones((), dtype), jnp.zeros((), jnp.result_type(int))
     wide = zero.dtype == jnp.int64
     depth = DEPTH if wide else 30
 
-    def look(local: Array, level: Array) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    def look(local: list[Array], level: Array) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Whether an interval has no root, and whether it has one that need not be isolated further."""
-        positive = local > 0
-        variations = jnp.sum(positive[:, 1:] != positive[:, :-1], axis=-1)
-        single = (variations == 1) & positive[:, 0]
-        others_negative = jnp.sum(jnp.any(positive, axis=-1)) == 1
-        begun = ~jnp.any(positive[:, 0])
+        positive = [x > 0 for x in local]
+        variations = sum((p != q).astype(jnp.int32) for p, q in zip(positive, positive[1:]))
+        single = (variations == 1) & positive[0]
+        others_negative = jnp.sum(ft.reduce(jnp.logical_or, positive)) == 1
+        begun = ~jnp.any(positive[0])
         return no_root(local), begun | (jnp.any(single) & others_negative) | (level >= depth)
 
     def busy(state: tuple) -> Bool[Array, ""]:
@@ -195,19 +201,19 @@ def first_root(c: Float[Array, "parts coefficients"]) -> tuple[Bool[Array, ""], 
         up = jnp.minimum(up, level)
         over = free & ((after >> level) == 1)
         level, index = jnp.where(free, level - up, level + 1), jnp.where(free, after >> up, 2 * index)
-        a, width = index.astype(c.dtype), 0.5 ** level.astype(c.dtype)
-        local = jnp.where(level == 0, c, _restrict(c, a * width, (a + 1) * width))
+        start, width = index.astype(dtype), 0.5 ** level.astype(dtype)
+        weights = jnp.asarray(binomials(n), dtype)
+        local = _restrict(jnp.stack(a, axis=-1) / weights, start * width, (start + 1) * width) * weights
+        local = [jnp.where(level == 0, x, local[:, j]) for j, x in enumerate(a)]
         return level, index, local, *look(local, level), over
 
-    free, sure = look(c, zero)
-    level, index, local, free, _, over = jax.lax.while_loop(busy, walk, (zero, zero, c, free, sure, free))
+    free, sure = look(a, zero)
+    level, index, local, free, _, over = jax.lax.while_loop(busy, walk, (zero, zero, a, free, sure, free))
     found = ~over & ~free
-    positive = local > 0
-    begun = ~jnp.any(positive[:, 0])
-    part = jnp.argmax(positive[:, 0] & ~positive[:, -1])
-    chosen = local[part] if local.shape[0] > 1 else local[0]
+    begun = ~jnp.any(local[0] > 0)
+    part = jnp.argmax((local[0] > 0) & (local[-1] <= 0))
+    chosen = [x[part] if len(x) > 1 else x[0] for x in local]
     polished = found & (chosen[0] > 0) & (chosen[-1] <= 0)
-    safe = jnp.where(polished, chosen, jnp.asarray(np.linspace(1, -1, c.shape[-1]), c.dtype))
-    place = jnp.where(polished, _polish(safe), jnp.where(begun, 0.0, 0.5))
-    root = (index.astype(c.dtype) + place) * 0.5 ** level.astype(c.dtype)
+    place = jnp.where(polished, _polish(chosen, polished), jnp.where(begun, 0.0, 0.5))
+    root = (index.astype(dtype) + place) * 0.5 ** level.astype(dtype)
     return found, jnp.where(found, root, one)

@@ -9,8 +9,9 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._crossing import bend, deflate, first_root
+from ._crossing import bend, deflate, first_root, largest
 from ._filippov import Model, State
+from ._once import once
 from ._settle import settle
 from ._solution import RESULTS
 from ._step import stack, Stepper
@@ -83,7 +84,7 @@ def locate(
     y: Y,
     f0: Y,
     state: State,
-    coefficients: Float[Array, "slots parts coefficients"],
+    polynomials: list[Float[Array, "slots parts"]],
     noise: Float[Array, "slots parts"],
 ) -> tuple[Bool[Array, ""], Scalar, Y, Int[Array, ""], Int[Array, ""]]:
     """The earliest event of a step: its time, the state there, the slot and the part of the guard that fires.
@@ -93,7 +94,7 @@ def locate(
     its Taylor series to second order, so that what remains is of third order in the (small) error of the dense output.
     """
     known = model.stacked(model.known_roots(state), 0)
-    found, root = jax.vmap(first_root)(deflate(coefficients, known))
+    found, root = jax.vmap(first_root)(deflate(polynomials, known))
     args = (model, t, y, f0, state)
     frozen_model, start, y_start, f_start, _ = frozen(args)
 
@@ -106,7 +107,7 @@ def locate(
     # A multiplier that stays at its bound, or a guard which begins with a double root, has no sign if it does not rise
     # above rounding on the whole step.
     least = jnp.asarray([0 if slot.holding else 2 for slot in model.slots], known.dtype)[:, None]
-    found = found & ~jnp.any((jnp.max(jnp.abs(coefficients), axis=-1) <= noise) & (known >= least), axis=-1)
+    found = found & ~jnp.any((once(largest(polynomials)) <= noise) & (known >= least), axis=-1)
     root = jnp.where(found, root, jnp.inf)
     earliest = jnp.min(root)
     length = lax.stop_gradient(t_next) - start
@@ -206,11 +207,11 @@ def land(
     y: Y,
     f0: Y,
     state: State,
-    coefficients: Float[Array, "slots parts coefficients"],
+    polynomials: list[Float[Array, "slots parts"]],
     noise: Float[Array, "slots parts"],
 ) -> Landing:
     """Locates the earliest event of a step and makes the transition there."""
-    found, te, before, slot, part = locate(model, stepper, t, t_next, y, f0, state, coefficients, noise)
+    found, te, before, slot, part = locate(model, stepper, t, t_next, y, f0, state, polynomials, noise)
     if model.holdable:
         before = model.project(te, before, state)  # what leaves a surface must do so from there, and not from beside it
     halted = te <= t
@@ -312,7 +313,7 @@ def land(
         if isinstance(switch, impact):
             news = news | fired[k]
     cosine = transversality(model, te, before, state, slot, part)
-    bends = bend(coefficients[slot, part], (te - t) / jnp.where(halted, 1, t_next - t)) > 0
+    bends = bend([a[slot, part] for a in polynomials], (te - t) / jnp.where(halted, 1, t_next - t)) > 0
     grazes = found & news & ~halted & bends & (cosine < jnp.cbrt(jnp.finfo(te.dtype).eps))
     points = None
     if want_points:

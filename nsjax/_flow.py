@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Int, PyTree
 
 from ._compact import compact_cond
 from ._event import land, Landing
@@ -77,14 +77,9 @@ class Flow(eqx.Module):
     affine: tuple[bool, ...] = eqx.field(static=True)  # whether each guard is affine in (t, y)
     reverse: bool = eqx.field(static=True)  # whether the loop is to be transposed
 
-    def stacked(self, coefficients: list[list[list[Scalar]]]) -> Float[Array, "slots parts coefficients"]:
-        """Bernstein coefficients of the guards as one array, of one degree."""
-        n = max(len(c) for row in coefficients for c in row) - 1
-        return self.model.stacked([[self.stepper.bernstein(c, n) for c in row] for row in coefficients], -1.0)
-
     def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list, noise: list) -> Landing:
         """The step once more, to its first event."""
-        polynomials = self.stacked(lax.stop_gradient(coefficients))
+        polynomials = once(self.stepper.scaled(self.model, lax.stop_gradient(coefficients)))
         noises = self.model.stacked(lax.stop_gradient(noise), 0.0)
         return land(self.model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials, noises)
 
@@ -97,10 +92,13 @@ class Flow(eqx.Module):
         t_next = step.t_next
         keep, dt, controller, outcome = self.pace(c, step)
         halvings, result = c.halvings, RESULTS.promote(outcome)
+        if step.fits is not True:
+            result = RESULTS.where(step.fits, result, RESULTS.mode_not_affine)
         busy = jnp.zeros((), bool)
         if model.slots:
             known = model.known_roots(c.state)
-            is_finite, quiet = self.survey(step.guards, known)
+            low = self.survey(step.guards, known)
+            is_finite, quiet = low == low, low > 0
             result = RESULTS.where(keep & ~is_finite, RESULTS.nonfinite_field, result)
             # A guard that is no polynomial to the precision needed is not trusted: a shorter step is. (At most so
             # often: one with a kink never is.)
@@ -139,11 +137,11 @@ class Flow(eqx.Module):
         )
         return keep, b - a, controller, outcome
 
-    def survey(self, coefficients: list, known: list) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Whether all coefficients are finite, and whether certainly no guard has a root on the step but those known:
-        one of its parts is positive all along."""
-        rows = [ft.reduce(jnp.maximum, map(self.stepper.least, row, roots)) for row, roots in zip(coefficients, known)]
-        return finite(coefficients), once(ft.reduce(jnp.minimum, rows)) > 0
+    def survey(self, guards: list, known: list) -> Scalar:
+        """A lower bound of the guards along the step, leaving out their known roots; not a number if any coefficient is
+        not finite. Where it is positive no guard has a root: one of its parts is positive all along."""
+        rows = [ft.reduce(jnp.maximum, map(self.stepper.least, row, roots)) for row, roots in zip(guards, known)]
+        return once(ft.reduce(jnp.minimum, rows) + 0 * sum(c for row in guards for part in row for c in part))
 
     def arrive(self, c: Carry, attempt: _Attempt) -> Landing:
         """Where the step leads: to its end, or to the first event on it."""
@@ -285,7 +283,7 @@ def _backward(step: Step, known: list) -> Bool[Array, ""]:
             for r in (2, 3)[: len(c) - 2]:
                 clear = ft.reduce(jnp.maximum, map(jnp.abs, c[r:])) > noise
                 wrong = wrong | ((roots == r) & (c[r] < 0) & clear)
-    return wrong
+    return once(jnp.where(wrong, 1.0, 0.0)) > 0
 
 
 def finite(tree: Any) -> Bool[Array, ""]:

@@ -209,6 +209,13 @@ class Series:
             return [self.pair(k, e, operands[0], results[0])]
         if name in _DERIVATIVES:
             return [self.chain(k, e, operands, results[0])]
+        if name == "custom_linear_solve":
+            fixed = sum(e.params["const_lengths"])  # the matrix and its factors come first
+            if not any(self.varies(i) for i in operands[:fixed]):
+                pairs = zip(operands[:fixed], e.invars)
+                first = [self.full(self.term(i, 0), v) for i, v in pairs]
+                return list(bind(*first, *[self.full(c, v) for c, v in zip(new[fixed:], e.invars[fixed:])]))
+            name = "a linear solve whose matrix depends on time or state"
         raise TypeError(
             f"A Taylor series is not known of `{name}`, which the vector field or a surface contains. Use another "
             "`solver`, such as `diffrax.Dopri8()`, or write the model without it."

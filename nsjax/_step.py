@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ._crossing import elevate, nodes, to_bernstein, to_chebyshev
+from ._crossing import binomials, nodes, to_bernstein, to_chebyshev
 from ._filippov import Model, State
 from ._once import once
 from ._system import frozen
@@ -76,6 +76,7 @@ class Step(NamedTuple):
     guards: list[list[list[Scalar]]] = []  # `[slot][part][j]`: coefficients of polynomials that stand for the guards
     noise: list[list[Scalar]] = []  # `[slot][part]`: what rounding of time and state makes of them
     resolved: Bool[Array, ""] | bool = True  # whether they do so well
+    fits: Bool[Array, ""] | bool = True  # whether the method is made for such a field
 
 
 class Watch(NamedTuple):
@@ -94,6 +95,10 @@ class Stepper(eqx.Module):
 
     solver: eqx.AbstractVar[dfx.AbstractSolver]
     degree: eqx.AbstractVar[int]
+
+    def made_for(self, model: Model, state: State, t: Scalar, y: Y) -> "Stepper":
+        """The same for this model, or an error if the method cannot be used for it."""
+        return self
 
     @abc.abstractmethod
     def __call__(
@@ -114,10 +119,18 @@ class Stepper(eqx.Module):
         out: here the smallest of its Bernstein coefficients, of which the first vanish with these roots."""
         return ft.reduce(jnp.minimum, [jnp.where(j < roots, 1, x) if j < 3 else x for j, x in enumerate(c)])
 
-    def bernstein(self, c: list[Scalar], degree: int) -> Float[Array, " coefficients"]:
-        """Its Bernstein coefficients, those of `degree`."""
-        raised = jnp.stack(c)
-        return raised if len(c) == degree + 1 else jnp.asarray(elevate(len(c) - 1, degree), raised.dtype) @ raised
+    def scaled(self, model: Model, guards: list[list[list[Scalar]]]) -> list[Float[Array, "slots parts"]]:
+        """The polynomials of the guards as `_crossing` wants them: coefficients in Σ a_j u^j (1 - u)^(n - j)."""
+        n = max(len(c) for row in guards for c in row) - 1
+
+        def raised(c: list[Scalar]) -> list[Scalar]:
+            a = [w * x if w != 1 else x for w, x in zip(binomials(len(c) - 1), c)]
+            for _ in range(n + 1 - len(c)):
+                a = [a[0], *[x + y for x, y in zip(a, a[1:])], a[-1]]
+            return a
+
+        rows = [[raised(c) for c in row] for row in guards]
+        return [model.stacked([[c[j] for c in row] for row in rows], -1.0) for j in range(n + 1)]
 
     def pace(self, controller: Any, step: Step, t: Scalar, y: Y, length: Scalar) -> Any:
         """Whether a step is accurate enough and how long the next may be, for a method that finds this out itself; the

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ._crossing import binomials
 from ._filippov import Model, State
 from ._series import Coefficient, Series
-from ._step import jittered, RungeKutta, Step, Stepper, unresolved, Watch, with_multipliers
+from ._step import jittered, Step, Stepper, unresolved, Watch, with_multipliers
 from ._types import Scalar, Y
 
 
@@ -46,7 +47,7 @@ class Taylor(dfx.AbstractAdaptiveSolver):
     - `terms`: the number of terms after the first, at least 4. 12 to 20 suit double precision, 8 single precision.
 
     **Raises:** `TypeError` on use, naming the operation, if the field or a surface contains one whose series is not
-    known (loops, `lax.cond`, linear solves).
+    known (loops, `lax.cond`, linear solves with a matrix that depends on the state).
     """
 
     terms: int = eqx.field(static=True, default=16)
@@ -260,9 +261,10 @@ class TaylorStepper(Stepper):
         low[-1] -= sum(map(jnp.abs, c[:n:-1]), jnp.zeros_like(low[-1]))
         return super().least(low, roots)
 
-    def bernstein(self, c: list[Scalar], degree: int) -> Float[Array, " coefficients"]:
-        powers = jnp.stack(c)
-        return jnp.asarray(_from_powers(degree), powers.dtype) @ powers
+    def scaled(self, model: Model, guards: list[list[list[Scalar]]]) -> list[Float[Array, "slots parts"]]:
+        powers = model.stacked([[jnp.stack(c) for c in row] for row in guards], -1.0)
+        matrix = _from_powers(self.degree) * np.array(binomials(self.degree))[:, None]
+        return list(jnp.tensordot(jnp.asarray(matrix, powers.dtype), powers, axes=(1, 2)))
 
     def points(self, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
         matrix = _from_powers(self.degree)
@@ -306,7 +308,3 @@ def _resolvable(columns: list[list[Scalar]], dt: Scalar) -> Scalar:
         ratio = 0.5 * unresolved(dt.dtype) * _size(c) / _size(c[-3:])
         fit = jnp.minimum(fit, jnp.where(ratio < 1, ratio, 1) ** (1 / n))
     return fit * dt
-
-
-def make_stepper(solver: dfx.AbstractSolver) -> Stepper:
-    return TaylorStepper(solver) if isinstance(solver, Taylor) else RungeKutta(solver)

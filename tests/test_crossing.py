@@ -9,7 +9,7 @@ import pytest
 from models import Roots
 
 import nsjax
-from nsjax._crossing import deflate, elevate, first_root, no_root, nodes, to_bernstein, to_chebyshev
+from nsjax._crossing import bend, binomials, deflate, first_root, largest, no_root, nodes, to_bernstein, to_chebyshev
 
 
 def evaluate(c, u):
@@ -31,7 +31,13 @@ def from_roots(roots: np.ndarray) -> np.ndarray:
     return np.array([np.polynomial.polynomial.polyfromroots(r) for r in roots])
 
 
-search = jax.jit(jax.vmap(first_root))
+def coefficients(c: jax.Array) -> list[jax.Array]:
+    """Those of the library from Bernstein coefficients along the last axis."""
+    n = c.shape[-1] - 1
+    return [w * c[..., j] for j, w in enumerate(binomials(n))]
+
+
+search = jax.jit(jax.vmap(lambda c: first_root(coefficients(c))))
 
 
 @pytest.mark.parametrize("n", [1, 4, 8])
@@ -43,13 +49,16 @@ def test_polynomial_bases(n):
     values = np.polynomial.polynomial.polyval(nodes(n), power)
     np.testing.assert_allclose(to_bernstein(n) @ values, c, atol=1e-11)
     np.testing.assert_allclose([evaluate(jnp.asarray(c), x) for x in u], exact, atol=1e-13)
-    np.testing.assert_allclose([evaluate(elevate(n, n + 3) @ c, x) for x in u], exact, atol=1e-13)
+    assert largest(coefficients(jnp.asarray(c))) == abs(c).max()
+    curved = np.polynomial.polynomial.polyval(u, np.polynomial.polynomial.polyder(power, 2))
+    assert all(np.sign(bend(coefficients(jnp.asarray(c)), jnp.asarray(x))) == np.sign(y) for x, y in zip(u, curved))
     chebyshev = np.polynomial.chebyshev.chebval(2 * u - 1, to_chebyshev(n) @ values)
     np.testing.assert_allclose(chebyshev, exact, atol=1e-13)
     for k in (1, 2)[:n]:
         lifted = bernstein(np.concatenate([np.zeros(k), power[: n + 1 - k]]))  # τ^k p, of degree n
         low = np.polynomial.polynomial.polyval(u, power[: n + 1 - k])
-        got = [evaluate(deflate(jnp.asarray(lifted), jnp.asarray(k)), x) for x in u]
+        a = deflate(coefficients(jnp.asarray(lifted)), jnp.asarray(k))
+        got = [evaluate(np.array(a) / binomials(n), x) for x in u]
         np.testing.assert_allclose(got, low, atol=1e-12)
 
 
@@ -118,7 +127,8 @@ def test_maximum_of_two_parts():
     found, tau = search(jnp.asarray([[a, -np.ones(3)], [a, b], [-a, b], [a, -a]]))
     assert list(found) == [True, True, False, True]  # -a is positive from 0.3 on, so that one part always is
     np.testing.assert_allclose(tau[np.array([0, 1, 3])], [0.3, 0.6, 0.3], atol=1e-14)
-    assert not no_root(jnp.asarray([a, b])) and no_root(jnp.asarray([a, np.ones(3)]))
+    assert not no_root(coefficients(jnp.asarray([a, b])))
+    assert no_root(coefficients(jnp.asarray([a, np.ones(3)])))
 
 
 # The property test of the flow: prescribed roots, found by `solve`.
@@ -174,7 +184,7 @@ def test_no_root_missed_and_none_out_of_order(count):
 @pytest.mark.parametrize("degree", [7, 12])
 def test_steep_polynomial(degree):
     """Pitfall 8: arctan(50 (r - τ)) as a polynomial of that degree; Newton's method from most places leaves [0, 1]."""
-    place = jax.jit(jax.vmap(lambda c: first_root(c[None])))
+    place = jax.jit(jax.vmap(lambda c: first_root(coefficients(c[None]))))
     r = np.linspace(0.02, 0.98, 97)
     values = np.arctan(50 * (r[:, None] - nodes(degree)))
     c = values @ to_bernstein(degree).T
@@ -189,9 +199,9 @@ def test_steep_polynomial(degree):
 @pytest.mark.parametrize("degree", [2, 6, 9])
 def test_root_next_to_its_mirror_image(degree):
     """δ² - τ² falls to zero at δ; with a small δ a step of Newton's or Halley's method from 0 says nothing."""
-    place = jax.jit(lambda c: first_root(c[None]))
+    place = jax.jit(lambda c: first_root(coefficients(c[None])))
     for delta in 10.0 ** -np.arange(1, 8):
-        c = elevate(2, degree) @ np.array([delta**2, delta**2, delta**2 - 1])
+        c = bernstein(np.array([delta**2, 0, -1, *[0] * (degree - 2)]))
         found, root = place(jnp.asarray(c))
         assert found
         np.testing.assert_allclose(root, delta, rtol=1e-14 / delta)

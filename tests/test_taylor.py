@@ -56,6 +56,11 @@ FUNCTIONS = {
         lambda x: 2 * x * x,
         0.3,
     ),
+    "linear solve": (
+        lambda x: jnp.linalg.solve(jnp.array([[2.0, 1.0], [1.0, 3.0]]), jnp.stack([jnp.sin(x), x]))[0],
+        lambda x: (3 * mp.sin(x) - x) / 5,
+        0.3,
+    ),
     "norm": (lambda x: jnp.linalg.norm(jnp.stack([x, 1 + x])), lambda x: mp.sqrt(x * x + (1 + x) ** 2), 0.3),
     "shared": (
         lambda x: jnp.sin(2 * x) * jnp.cos(2 * x) / (1 + jnp.sin(2 * x)),
