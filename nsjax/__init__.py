@@ -1,6 +1,7 @@
 """nsjax: differentiable piecewise-smooth dynamics in JAX."""
 
 from . import gallery as gallery, plot as plot
+from ._exponential import Exponential as Exponential
 from ._orbit import find_orbit as find_orbit, Orbit as Orbit
 from ._regularise import banded as banded, smoothed as smoothed
 from ._saltation import (

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from diffrax._root_finder import use_stepsize_tol
 from jax.core import Tracer
 
+from ._exponential import Exponential
 from ._filippov import Model, State
 from ._structure import is_affine, is_constant
 from ._system import impact, relay, sgn, System
@@ -75,6 +76,11 @@ def check_solve(
     for name in ("solver_state", "controller_state", "made_jump"):
         if getattr(saveat, name):
             raise ValueError(f"Argument `saveat` must not ask for `{name}`, which a flow with events does not have.")
+    if isinstance(solver, Exponential) and isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
+        raise ValueError(
+            "Argument `adjoint` must not be `RecursiveCheckpointAdjoint` for `Exponential`, whose matrix exponential "
+            "is a loop of unknown length; use `diffrax.DirectAdjoint()`."
+        )
     controller = _controller(controller, dtype)
     return y0, t0, t1, _implicit(solver, controller, adjoint), controller, _given(system, mode)
 

@@ -43,6 +43,11 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "Events followed one another without any progress in time: the model chatters. A relay whose two surfaces "
         "coincide, or a reset that does not leave its surface, does this."
     )
+    mode_not_affine = (
+        "`nsjax.Exponential` met a mode that it cannot step exactly: its forcing is neither constant, linear or "
+        "quadratic in time, exponential, nor harmonic of one frequency; or it slides or rests where the field that "
+        "does so is not affine in the state. Take `nsjax.Taylor()` or a Runge-Kutta solver."
+    )
     nonfinite_field = "The vector field or an indicator function returned a value that is not finite (NaN or infinity)."
     wrong_mode = "Argument `mode` places the start on one side of a surface, but `y0` lies clearly on the other."
     wrong_reset = (

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from ._check import check_contacts, check_model, check_solve
+from ._exponential import Exponential, ExponentialStepper
 from ._filippov import Model, State
 from ._flow import Carry, finite, Flow
 from ._forward import forward_only
@@ -20,9 +21,10 @@ from ._jacobian import dense_jacobian
 from ._save import Log, Saved
 from ._solution import Events, is_okay, raise_if, RESULTS, Solution
 from ._start import start_mode
+from ._step import RungeKutta, Stepper
 from ._structure import is_affine
 from ._system import arrays_of, System
-from ._taylor import make_stepper
+from ._taylor import Taylor, TaylorStepper
 from ._types import Scalar, Y
 
 
@@ -66,9 +68,9 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     start, stop = t0 * direction, t1 * direction
     model = Model(system, direction, start, y0)
     start = check_contacts(model, start, y0)
-    stepper = make_stepper(solver)
     max_events = max_events if model.slots else 0
     state, forked, result = start_mode(model, start, y0, given)
+    stepper = _stepper(solver).made_for(model, state, start, y0)
     y0 = model.project(start, y0, state)  # a change of y0 off the surface that holds it changes nothing
     f0 = model.flow(start, y0, state)
 
@@ -172,6 +174,12 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     return sol
 
 
+def _stepper(solver: Any) -> Stepper:
+    if isinstance(solver, Taylor):
+        return TaylorStepper(solver)
+    return ExponentialStepper(solver) if isinstance(solver, Exponential) else RungeKutta(solver)
+
+
 def _strong(x: Any) -> Any:
     return jnp.asarray(x) if isinstance(x, (bool, int, float)) else x
 
@@ -252,8 +260,8 @@ def solve(
         (also on a repulsive surface); `relay` 0 or 1 (needed between its two surfaces, 0 by default); `impact` 0 or 1
         to rest. Where the solution is not unique this chooses one; without it static friction holds as long as it can,
         a repulsive surface that is reached is crossed, and a start on one is refused. `Solution.unique` tells.
-    - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, Euler, or
-        `nsjax.Taylor`.
+    - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, Euler,
+        `nsjax.Taylor`, or for models that are affine in the state `nsjax.Exponential`.
     - `stepsize_controller`: by default `diffrax.PIDController` with `rtol = atol = 1e-8` (1e-5 for float32).
     - `saveat`: as in diffrax: `t0`, `t1`, `ts`, `steps`, `fn(t, y, system)`, `dense`.
     - `dt0`: first step; chosen automatically by default.

@@ -24,6 +24,7 @@ ORDER = (
     "_step",
     "_series",
     "_taylor",
+    "_exponential",
     "_solution",
     "_sensitivity",
     "_save",
