@@ -123,7 +123,10 @@ def locate(
     plain = (root - earliest) * length
     trusted = (rate < 0) & (jnp.abs(shift) <= 1e-2 * length) & (plain <= 1e-4 * length)
     shift = jnp.where(trusted, shift, plain)
-    slot = jnp.argmin(jnp.where(found, shift, jnp.inf)).astype(jnp.int32)
+    # Of events at one instant the first in the order of declaration: as long as no guard has fallen below its rounding.
+    blur = jnp.take_along_axis(noise, part[:, None], axis=-1)[:, 0] / jnp.where(rate == 0, 1, jnp.abs(rate))
+    latest = jnp.min(jnp.where(found, shift + jnp.where(trusted, blur, 0), jnp.inf))
+    slot = jnp.argmax(found & (shift <= latest)).astype(jnp.int32)
     te = jnp.clip(guess + shift[slot], start, start + length)
     dt = te - guess
     bend = jax.jvp(flow, (guess, y_guess), (one, f))[1]
