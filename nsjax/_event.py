@@ -391,6 +391,7 @@ def completed(model: Model, k: int, te: Scalar, before: Y, after: Y, state: Stat
     rise = rate(te, after)
     f = model.flow(te, after, state_after)
     pull = jax.jvp(rate, (te, after), (one, f))[1]
+    (blur,) = model.rounding(lambda t, y: (jax.jvp(rate, (t, y), (one, model.flow(t, y, state_after)))[1],), te, after)
     h = jnp.stack(model.h(k, te, after))
     noise = model.rounding(lambda t, y: model.h(k, t, y), te, after)
     slack = 1e4 * noise + 2 * jnp.abs(jnp.stack(model.h(k, te, before)))
@@ -402,7 +403,8 @@ def completed(model: Model, k: int, te: Scalar, before: Y, after: Y, state: Stat
     rises = rise > least
     # Rounding of dh/dt, where the force is but rounding too, is no flight.
     flight = 2 * (rise - jnp.where(rises, 0, lax.stop_gradient(rise))) / jnp.where(pull < 0, -pull, 1)
-    possible = stays & ~wrong & (pull < 0) & (ratio < 1)
+    held = stays & ~rises & (jnp.abs(pull) <= blur)  # without any force
+    possible = stays & ~wrong & ((pull < 0) | held) & (ratio < 1)
     rest = jnp.where(possible, flight / (1 - jnp.where(possible, ratio, 0)), 0)
     drift = jax.tree.map(lambda x, f: x + rest * f, after, f)
     impulse = jax.tree.map(jnp.subtract, after, before)

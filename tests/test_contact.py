@@ -286,6 +286,39 @@ def test_two_contacts():
     np.testing.assert_allclose(flat(sol.y1), 0, atol=1e-14)
 
 
+class Relaxed(nsjax.System):
+    """A spring that has its natural length at the stop."""
+
+    k: float
+    a: float
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -self.k * y.x + self.k * self.a + s.stop)
+
+    @nsjax.impact
+    def stop(self, t, y):
+        return y.x - self.a
+
+    @stop.restitution
+    def stop(self):
+        return 0.0
+
+
+def test_rest_without_force():
+    """After a plastic impact nothing moves and no force acts, but for their rounding, whatever its sign."""
+
+    @jax.jit
+    @jax.vmap
+    def run(k, a):
+        sol = solve(Relaxed(k=k, a=a), 0.0, 8.0, Motion(a, jnp.asarray(0.1)), throw=False)
+        return sol.result == RESULTS.successful, sol.mode1[0], sol.events.num, sol.y1.x - a
+
+    k, a = np.random.default_rng(0).uniform(0.3, 1, (2, 64))
+    good, mode, num, gap = run(jnp.asarray(k), jnp.asarray(a))
+    assert np.all(good) and np.all(mode == 1) and np.all(num == 1)
+    np.testing.assert_allclose(gap, 0, atol=1e-15)
+
+
 class Bar(nsjax.System):
     """Height x and tilt z of a bar on a support under either end."""
 
