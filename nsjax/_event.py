@@ -124,7 +124,10 @@ def locate(
     plain = (root - earliest) * length
     trusted = (rate < 0) & (jnp.abs(shift) <= 1e-2 * length) & (plain <= 1e-4 * length)
     shift = jnp.where(trusted, shift, plain)
-    slot = jnp.argmin(jnp.where(found, shift, jnp.inf)).astype(jnp.int32)
+    # Of events at one instant the first in the order of declaration: as long as no guard has fallen below its rounding.
+    blur = jnp.take_along_axis(noise, part[:, None], axis=-1)[:, 0] / jnp.where(rate == 0, 1, jnp.abs(rate))
+    latest = jnp.min(jnp.where(found, shift + jnp.where(trusted, blur, 0), jnp.inf))
+    slot = jnp.argmax(found & (shift <= latest)).astype(jnp.int32)
     te = jnp.clip(guess + shift[slot], start, start + length)
     dt = te - guess
     bend = jax.jvp(flow, (guess, y_guess), (one, f))[1]
@@ -136,8 +139,9 @@ def locate(
     return jnp.any(found), te, y_end, slot, part[slot]
 
 
-def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> Y:
-    """The state after an impact: the user's reset, or Newton's law with the impulse along ∂f/∂s.
+def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> tuple[Y, Y]:
+    """The state after an impact, by the user's reset or by Newton's law with the impulse along ∂f/∂s; and the size of
+    the terms of which it is the sum: where they cancel, what is left is their rounding.
 
     Contacts that rest take impulses of their own, as far as these push; friction that the contact force enters acts in
     the impact too, up to where it stops the sliding. Backwards in time Newton's law is inverted (1/e).
@@ -145,7 +149,8 @@ def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> Y:
     switch = model.switches[k]
     assert isinstance(switch, impact)
     if switch.reset_fn is not None:
-        return switch.reset_fn(model.system, t * model.direction, y)
+        out = switch.reset_fn(model.system, t * model.direction, y)
+        return out, jax.tree.map(lambda a, b: jnp.abs(a) + jnp.abs(b), y, out)
     assert switch.restitution_fn is not None
     e = jnp.asarray(switch.restitution_fn(model.system), t.dtype)
     e = jnp.where(model.direction > 0, e, 1 / e)
@@ -156,7 +161,7 @@ def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> Y:
         # Only dh/dt depends on the velocities, and for given positions it is affine in them.
         return [model.level(j, t, y, state) if j in model.contacts else model.approach(j, t, y, state) for j in which]
 
-    def hit(s: tuple) -> Y:
+    def hit(s: tuple) -> tuple[Y, Y]:
         def push(j: int) -> Y:
             unit = tuple(jnp.where(i == j, 1, 0).astype(t.dtype) for i in range(len(s)))
             return jax.jvp(lambda s: model.field(t, y, s), (s,), (unit,))[1]
@@ -176,18 +181,19 @@ def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> Y:
                 held = held & ((p >= 0) | (jnp.arange(len(which)) == 0))  # no contact pulls
             square = jnp.where(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
             impulses = list(jnp.linalg.solve(square, jnp.where(held, want, 0)))
-        out = y
+        out, size = y, jax.tree.map(jnp.abs, y)
         for p, direction in zip(impulses, pushes):
             out = jax.tree.map(lambda a, b, p=p: a + p * b, out, direction)
-        return out
+            size = jax.tree.map(lambda a, b, p=p: a + jnp.abs(p * b), size, direction)
+        return out, frozen(size)
 
     s = model.values(t, y, state)
     for j in model.holdable:
-        if j in model.contacts or is_constant(lambda sj, j=j: hit(s[:j] + (sj,) + s[j + 1 :]), s[j]):
+        if j in model.contacts or is_constant(lambda sj, j=j: hit(s[:j] + (sj,) + s[j + 1 :])[0], s[j]):
             continue
 
         def slip(sj: Scalar, j: int = j) -> Scalar:
-            return model.level(j, t, hit(s[:j] + (sj,) + s[j + 1 :]), state)
+            return model.level(j, t, hit(s[:j] + (sj,) + s[j + 1 :])[0], state)
 
         # Where friction would reverse the sliding it ends it: the value that does so is found by one Newton step.
         end, slope = jax.jvp(slip, (s[j],), (jnp.ones_like(s[j]),))
@@ -230,14 +236,19 @@ def land(
             parts[k] = jnp.where(now, jnp.where(state.mode[k] < 0, part.astype(jnp.int32), number), parts[k])
 
     result = RESULTS.successful
-    after = before
+    after, size = before, jax.tree.map(jnp.abs, before)
     for k, switch in enumerate(model.switches):
         roots[k] = jnp.where(halted, roots[k], 0)
         if isinstance(switch, relay):
             modes[k] = jnp.where(fired[k], 1 - modes[k], modes[k])
         elif isinstance(switch, impact):
-            hit = rebound(model, k, te, before, state._replace(part=tuple(parts)))
-            after = jax.tree.map(lambda a, b, now=fired[k]: jnp.where(now, a, b), hit, after)
+            touching = state._replace(part=tuple(parts))
+            # Another impact at this instant may have opened it: then h < 0 is rounding.
+            opens = fired[k] & (model.approach(k, te, before, touching) > slow(model, k, te, before, touching))
+            roots[k] = jnp.where(opens, 1, roots[k])
+            fired[k] = fired[k] & ~opens
+            hit = rebound(model, k, te, before, touching)
+            after, size = jax.tree.map(lambda a, b, now=fired[k]: jnp.where(now, a, b), hit, (after, size))
     at = {}
     for k, switch in enumerate(model.switches):
         if isinstance(switch, sgn):
@@ -249,10 +260,11 @@ def land(
                 # An impact may carry the state across the surface, or off it: the switch follows at once.
                 h0 = jnp.min(jnp.stack(model.h(k, te, before)))
                 h1 = jnp.min(jnp.stack(model.h(k, te, after)))
-                moved = jnp.abs(h1 - h0) > jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), te, before))
-                modes[k] = jnp.where(moved, jnp.sign(h1).astype(jnp.int32), modes[k])
+                slack = jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), te, after, size))
+                moved, off = jnp.abs(h1 - h0) > slack, jnp.abs(h1) > slack
+                modes[k] = jnp.where(moved & off, jnp.sign(h1).astype(jnp.int32), modes[k])
                 roots[k] = jnp.where(moved, 0, roots[k])
-                here = (here & ~moved) | (moved & (h1 == 0))
+                here = jnp.where(moved, ~off, here)
             at[k] = here
     state_after = State(tuple(m.astype(jnp.int32) for m in modes), tuple(parts), tuple(roots))
 
@@ -271,11 +283,15 @@ def land(
         fresh = jnp.where(end.stays, jnp.where(end.rises, 1, 2), 0)
         roots[k] = jnp.where(fired[k], fresh, roots[k]).astype(jnp.int32)
         if k in model.contacts:
-            # Another impact may set a resting contact in motion: it lifts off, or is hit at once.
+            # Another impact may set a resting contact in motion: it lifts off for more than a brief flight, or is hit
+            # at once.
             level = model.level(k, te, jumped, state_after)
-            (slack,) = model.rounding(lambda t, y, k=k: (model.level(k, t, y, state_after),), te, jumped)
+            (slack,) = model.rounding(lambda t, y, k=k: (model.level(k, t, y, state_after),), te, jumped, size)
+            free = state_after._replace(mode=tuple(jnp.where(j == k, 0, m) for j, m in enumerate(state_after.mode)))
+            (pull,) = model.rates((k,), te, jumped, free, model.values(te, jumped, free))
             moved = level != model.level(k, te, before, state_after)
             moved = moved & (state.mode[k] == 1) & (jnp.abs(level) > 1e3 * slack)
+            moved = moved & ((level < 0) | (2 * level > -pull * brief))
             modes[k] = jnp.where(moved, 0, modes[k])
             roots[k] = jnp.where(moved, (level > 0).astype(jnp.int32), roots[k])
             at[k] = ends | ((state.mode[k] == 1) & ~moved)
@@ -340,6 +356,14 @@ def transversality(model: Model, t: Scalar, y: Y, state: State, slot: Int[Array,
     return jnp.abs(n @ f + h_t) / jnp.sqrt(size)
 
 
+def slow(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+    """What rounding can make of dh/dt of switch k along the flow."""
+    model, t, y = frozen((model, t, y))
+    f = model.flow(t, y, state)
+    terms = model.sizes(lambda t, y: model.h(k, t, y), t, y, jnp.ones_like(t), f)
+    return 64 * jnp.finfo(t.dtype).eps * terms[0 if state.part[k] is None else state.part[k]]
+
+
 class Completed(NamedTuple):
     """What an impact leads to: a flight, or with all the flights that would follow it a state of rest."""
 
@@ -368,17 +392,20 @@ def completed(model: Model, k: int, te: Scalar, before: Y, after: Y, state: Stat
     rise = rate(te, after)
     f = model.flow(te, after, state_after)
     pull = jax.jvp(rate, (te, after), (one, f))[1]
+    (blur,) = model.rounding(lambda t, y: (jax.jvp(rate, (t, y), (one, model.flow(t, y, state_after)))[1],), te, after)
     h = jnp.stack(model.h(k, te, after))
     noise = model.rounding(lambda t, y: model.h(k, t, y), te, after)
     slack = 1e4 * noise + 2 * jnp.abs(jnp.stack(model.h(k, te, before)))
     part = 0 if state_after.part[k] is None else state_after.part[k]
     stays = jnp.abs(h[part]) <= slack[part]
-    wrong = jnp.any(h < -slack) | (stays & (rise < -1e-9 * jnp.abs(speed)))
-
-    slow = 64 * eps * (jnp.abs(speed) + model.sizes(lambda t, y: model.h(k, t, y), te, after, one, f)[part])
+    least = 64 * eps * jnp.abs(speed) + slow(model, k, te, after, state_after)
+    wrong = jnp.any(h < -slack) | (stays & (rise < -jnp.maximum(1e-9 * jnp.abs(speed), least)))
     ratio = jnp.where(speed == 0, 0, -rise / jnp.where(speed == 0, 1, speed))
-    flight = 2 * rise / jnp.where(pull < 0, -pull, 1)
-    possible = stays & ~wrong & (pull < 0) & (ratio < 1)
+    rises = rise > least
+    # Rounding of dh/dt, where the force is but rounding too, is no flight.
+    flight = 2 * (rise - jnp.where(rises, 0, lax.stop_gradient(rise))) / jnp.where(pull < 0, -pull, 1)
+    held = stays & ~rises & (jnp.abs(pull) <= blur)  # without any force
+    possible = stays & ~wrong & ((pull < 0) | held) & (ratio < 1)
     rest = jnp.where(possible, flight / (1 - jnp.where(possible, ratio, 0)), 0)
     drift = jax.tree.map(lambda x, f: x + rest * f, after, f)
     impulse = jax.tree.map(jnp.subtract, after, before)
@@ -386,4 +413,4 @@ def completed(model: Model, k: int, te: Scalar, before: Y, after: Y, state: Stat
     scale = jnp.where(gain == 0, 0, left / jnp.where(gain == 0, 1, gain))
     rested = jax.tree.map(lambda x, d: x - scale * d, drift, impulse)
     low = 0.25 * flight * rise <= 1e3 * noise[part]
-    return Completed(rise > slow, flight, rest, rested, possible, low, stays, wrong)
+    return Completed(rises, flight, rest, rested, possible, low, stays, wrong)

@@ -154,9 +154,11 @@ class Model(eqx.Module):
         sigma = jnp.stack([s[k] for k in which])
         slope = jax.jacfwd(rates)(sigma)
         if self.contacts and len(which) > 1:
-            # Friction along a contact that holds already is free: a trace of compliance gives it the value 0.
+            # Friction along a contact that holds already is free, and so is that of a contact without force: a trace of
+            # compliance gives it the value 0.
             dry = jnp.asarray([k not in self.contacts for k in which])
-            slope -= jnp.diag(jnp.where(dry, 4 * jnp.finfo(t.dtype).eps * jnp.sum(jnp.abs(slope), axis=1), 0))
+            total, least = jnp.sum(jnp.abs(slope), axis=1), jnp.sqrt(jnp.finfo(t.dtype).tiny)
+            slope -= jnp.diag(jnp.where(dry, jnp.where(total == 0, least, 4 * jnp.finfo(t.dtype).eps * total), 0))
         return rates(sigma), slope
 
     def values(self, t: Scalar, y: Y, state: State) -> tuple[Any, ...]:
@@ -317,6 +319,7 @@ class Model(eqx.Module):
         by_t, by_y = jax.jacfwd(lambda t, y: jnp.stack(fn(t, unravel(y))), argnums=(0, 1))(t, flat)
         return jnp.abs(by_t * dt) + jnp.sum(jnp.abs(by_y * jfu.ravel_pytree(dy)[0]), axis=-1)
 
-    def rounding(self, fn: Any, t: Scalar, y: Y) -> Array:
-        """What rounding of time and state alone can make of the entries of `fn(t, y)`: below it they count as zero."""
-        return 8 * jnp.finfo(t.dtype).eps * self.sizes(fn, t, y, t, y)
+    def rounding(self, fn: Any, t: Scalar, y: Y, size: Y | None = None) -> Array:
+        """What rounding of time and state alone can make of the entries of `fn(t, y)`: below it they count as zero.
+        `size`: that of the terms of which the state is the sum, if they may cancel."""
+        return 8 * jnp.finfo(t.dtype).eps * self.sizes(fn, t, y, t, y if size is None else size)

@@ -98,7 +98,7 @@ def _jump(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) ->
 
         def hit(t: Scalar, x: Array) -> tuple[Array, Scalar]:
             y = unravel(x)
-            bounced = rebound(model, k, t, y, state)
+            bounced, _ = rebound(model, k, t, y, state)
             flight = _states(model, t, bounced, after[:k] + (free,) + after[k + 1 :])
             end = completed(model, k, t, y, bounced, state, flight)
             rest = jnp.where(rests, end.rest, 0)

@@ -69,6 +69,7 @@ def settle(
         elif k in model.holdable:
             trial[k] = jnp.where(at[k], 0, mode[k])
     s, rates, slopes = look(trial)
+    noise = _noise(model, t, y, state, which, s)
     repels = {k: slopes[k] >= 0 for k in which}
     forked = false
     for k in which:
@@ -89,10 +90,10 @@ def settle(
             side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
             trial[k] = jnp.where(at[k], side, mode[k])
     if 1 < len(which) <= _TRIED:
-        trial, several, wrong = _best(model, t, which, at, came, leaves, trial, look)
+        trial, several, wrong = _best(model, t, which, at, came, leaves, trial, look, noise)
         forked = forked | several
     elif len(which) == 1:
-        trial, wrong = _amend(model, which, at, leaves, trial, look(trial))[0], false
+        trial, wrong = _amend(model, which, at, leaves, trial, look(trial), noise)[0], false
     else:
         # A bound that is reached together with that of another switch is left with it, not in a second event.
         leaves = dict(leaves)
@@ -106,7 +107,7 @@ def settle(
         # One release or taking back a round, until nothing is violated; so many rounds do for all to change twice.
         def amend(carry: tuple) -> tuple:
             count, trial, _ = carry
-            return count + 1, *_amend(model, which, at, leaves, trial, look(trial))
+            return count + 1, *_amend(model, which, at, leaves, trial, look(trial), noise)
 
         def unsettled(carry: tuple) -> Bool[Array, ""]:
             count, _, wrong = carry
@@ -125,7 +126,7 @@ def settle(
         if k in model.contacts:
             # It lifts off with h = dh/dt = 0, and where its force has reached zero d²h/dt² = 0 too.
             fresh = jnp.where(leaves[k] != 0, 3, 2)
-            edge = jnp.where(s[k] == 0, 1, 0)
+            edge = jnp.where(jnp.abs(s[k] * slopes[k]) <= noise[k], 1, 0)
         else:
             # Leaving with dh/dt = 0 (the end of sliding with b = 1) makes a double root of h at this instant.
             simple = rates[k] * trial[k].astype(t.dtype) > 1e-10 * jnp.abs(slopes[k])
@@ -151,13 +152,23 @@ def forks(model: Model, k: int, multiplier: Scalar, slope: Scalar) -> Bool[Array
     return (size <= model.bound(k)) & ((slope > 0) | (size > 1 + _nearly(size)))
 
 
+def _noise(model: Model, t: Scalar, y: Y, state: State, which: tuple, s: dict) -> dict:
+    """What rounding can make of d²h/dt² of the contacts: a force below it counts as none, and holds."""
+    zero = jnp.zeros((), t.dtype)
+    if not model.contacts:
+        return {k: zero for k in which}
+    values = tuple(s.get(k, v) for k, v in enumerate(model.signs(t, state)))
+    blurs = model.rounding(lambda t, y: model.rates(model.contacts, t, y, state, values), t, y)
+    return {k: zero for k in which} | dict(zip(model.contacts, blurs))
+
+
 def _nearly(like: Scalar) -> float:
     """How closely two bounds must be reached to count as reached together."""
     return max(1e-10, 64 * float(jnp.finfo(like.dtype).eps))
 
 
 def _best(
-    model: Model, t: Scalar, which: tuple, at: dict, came: dict, leaves: dict, trial: dict, look: Any
+    model: Model, t: Scalar, which: tuple, at: dict, came: dict, leaves: dict, trial: dict, look: Any, noise: dict
 ) -> tuple[dict, Bool[Array, ""], Bool[Array, ""]]:
     """The valid assignment that holds most, of all; whether others hold as many, and whether the choice is open."""
     options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
@@ -174,7 +185,7 @@ def _best(
             if k in model.contacts:
                 stays = row[i] == 1
                 law = jnp.where(
-                    stays, (s[k] * slopes[k] >= 0) & (leaves[k] == 0), (rates[k] > small) | (leaves[k] != 0)
+                    stays, (s[k] * slopes[k] >= -noise[k]) & (leaves[k] == 0), (rates[k] > noise[k]) | (leaves[k] != 0)
                 )
             else:
                 stays = (row[i] == 0) & (k in model.holdable)
@@ -234,7 +245,7 @@ def _pinned(model: Model, t: Scalar, y: Y, state: State, at: dict, leaves: dict,
 
 
 def _amend(
-    model: Model, which: tuple, at: dict, leaves: dict, trial: dict, seen: tuple
+    model: Model, which: tuple, at: dict, leaves: dict, trial: dict, seen: tuple, noise: dict
 ) -> tuple[dict, Bool[Array, ""]]:
     """One release, or one taking back, of the switch that violates its law most."""
     s, rates, slopes = seen
@@ -242,7 +253,7 @@ def _amend(
     for k in which:
         held = at[k] & model.held(k, trial[k]) if k in model.holdable else jnp.zeros((), bool)
         if k in model.contacts:
-            over, against = -s[k] * slopes[k], -rates[k]
+            over, against = -s[k] * slopes[k] - noise[k], -rates[k]
         else:
             over = jnp.abs(s[k]) / (model.bound(k) if k in model.holdable else 1) - 1
             against = -rates[k] * trial[k].astype(rates[k].dtype)

@@ -225,6 +225,18 @@ def test_friction_by_the_contact_force():
     np.testing.assert_allclose(slow.y1.x, np.sqrt(2 * z / p.g), rtol=1e-12)
 
 
+def test_lift_off_without_sliding():
+    """A block that sticks takes off: where there is no contact force there is no friction to hold it, nor need for it."""
+
+    class Lifted(Block):
+        def vector_field(self, t, y, s):
+            return Thrown(y.u, y.v, -self.mu * s.floor * s.slide, (t - 1) * self.g + s.floor)
+
+    sol = solve(Lifted(), 0.0, 1.5, Thrown(0.3, 0.0, 0.0, 0.0), **TIGHT)
+    assert [tuple(e.mode_after.values()) for e in sol.events] == [(0, 0)]
+    np.testing.assert_allclose(flat(sol.y1), [0.3, 9.81 / 48, 0, 9.81 / 8], atol=1e-12)
+
+
 @pytest.mark.slow
 def test_fundamental_matrix_through_rest():
     """Two routes, while it slides at rest and after it sticks."""
@@ -272,6 +284,92 @@ def test_two_contacts():
     assert [tuple(e.mode_after.values()) for e in sol.events] == [(1, 0), (1, 1)]
     np.testing.assert_allclose(sol.events.t[:2], [1.0, np.sqrt(2)], rtol=1e-12)
     np.testing.assert_allclose(flat(sol.y1), 0, atol=1e-14)
+
+
+class Relaxed(nsjax.System):
+    """A spring that has its natural length at the stop."""
+
+    k: float
+    a: float
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -self.k * y.x + self.k * self.a + s.stop)
+
+    @nsjax.impact
+    def stop(self, t, y):
+        return y.x - self.a
+
+    @stop.restitution
+    def stop(self):
+        return 0.0
+
+
+def test_rest_without_force():
+    """After a plastic impact nothing moves and no force acts, but for their rounding, whatever its sign."""
+
+    @jax.jit
+    @jax.vmap
+    def run(k, a):
+        sol = solve(Relaxed(k=k, a=a), 0.0, 8.0, Motion(a, jnp.asarray(0.1)), throw=False)
+        return sol.result == RESULTS.successful, sol.mode1[0], sol.events.num, sol.y1.x - a
+
+    k, a = np.random.default_rng(0).uniform(0.3, 1, (2, 64))
+    good, mode, num, gap = run(jnp.asarray(k), jnp.asarray(a))
+    assert np.all(good) and np.all(mode == 1) and np.all(num == 1)
+    np.testing.assert_allclose(gap, 0, atol=1e-15)
+
+
+class Bar(nsjax.System):
+    """Height x and tilt z of a bar on a support under either end."""
+
+    e: float
+    l: float
+    J: float = 4.0
+
+    def vector_field(self, t, y, s):
+        return Thrown(y.u, y.v, -1.0 + s.left + s.right, self.l * (s.right - s.left) / self.J)
+
+    @nsjax.impact
+    def left(self, t, y):
+        return y.x - self.l * y.z
+
+    @nsjax.impact
+    def right(self, t, y):
+        return y.x + self.l * y.z
+
+    @left.restitution
+    def left(self):
+        return self.e
+
+    @right.restitution
+    def right(self):
+        return self.e
+
+
+def test_flat_landing():
+    """Both ends arrive at one instant, each above or below its support by rounding. The first impact opens the other
+    contact, which then has none (e = 0.9), or the bar rocks to rest (e = 0), whatever the height."""
+
+    @jax.jit
+    @jax.vmap
+    def run(x, e, l, t1):
+        sol = solve(Bar(e=e, l=l), 0.0, t1, Thrown(x, 0 * x, 0 * x, 0 * x), throw=False, **TIGHT)
+        return sol.result == RESULTS.successful, sol.y1, sol.events.num, sol.events.t, sol.mode1
+
+    c = np.tile(np.sqrt(2 * np.random.default_rng(0).uniform(1, 2, 32)), 2)  # speed, and time, of the fall
+    e, l, t1 = np.repeat([[0.9, 0.0], [0.5, 1.8], [1.2, 2.0]], 32, axis=1)
+    good, y1, num, t, mode = run(*map(jnp.asarray, (c**2 / 2, e, l, t1 * c)))
+    assert np.all(good)
+    free, rocks = e > 0, e == 0
+    assert np.all(num[free] == 1) and np.all(mode[rocks] == 1)
+    impulse, after = (1.9 * c / (1 + 0.25 / 4))[free], 0.2 * c[free]
+    end = [(impulse - c[free] - after / 2) * after, -impulse / 8 * after, impulse - c[free] - after, -impulse / 8]
+    np.testing.assert_allclose(np.stack([*y1])[:, free], end, atol=1e-11)
+    np.testing.assert_allclose(np.stack([*y1])[:, rocks], 0, atol=1e-14)
+    # Rates of opening shrink by `ratio`, while the other end rests: a geometric series of flights.
+    ratio, pull = (4 - 1.8**2) / (4 + 1.8**2), 2 * 1.8**2 / (4 + 1.8**2)
+    rest = np.take_along_axis(t, num[:, None] - 1, axis=1)[rocks, 0]
+    np.testing.assert_allclose(rest, c[rocks] * (1 + 2 * ratio / pull), rtol=2e-8)
 
 
 def test_accumulation_on_a_corner_is_told():

@@ -351,11 +351,13 @@ def test_every_restart_is_on_the_surface(a, v, c):
     jacobian, (out, num) = toggle()(jnp.asarray([a, v, c]), jnp.asarray(20.5 * flight))
     k = np.arange(1, 21)
     assert num == 20
-    np.testing.assert_allclose(out[:20], k * flight, rtol=1e-11)
+    late = 5e-13 * 20 * flight
+    np.testing.assert_allclose(out[:20], k * flight, atol=late)
     exact = np.stack([-k * flight / a, k * flight / v, 0 * k], -1)
     np.testing.assert_allclose(jacobian[:20], exact, atol=1e-10 * np.abs(exact).max())
     top = a * (flight / 2) ** 2 / 2 * np.sign(v)
-    np.testing.assert_allclose(out[-2:], [c + top, 0], atol=1e-11)
+    # What is late by so much has at the top a velocity of a times that.
+    np.testing.assert_allclose(out[-2:], [c + top, 0], atol=a * late)
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1e12])
