@@ -51,8 +51,8 @@ def _run(fn: Callable[..., Any], mapped: Any, rest: Any, lanes: int, chunk: int)
 
 
 def sweep(fn: Callable[..., Any], *args: Any, chunk: int | None = None) -> Any:
-    """Applies `fn` to every lane: `jax.vmap(fn)(*args)`, but compiled, and in chunks, which is faster and takes the
-    memory of one chunk only.
+    """Applies `fn` to every lane: `jax.vmap(fn)(*args)`, but compiled, and in chunks, which on a CPU is faster for
+    thousands of lanes, and works in the memory of one chunk.
 
     ```python
     def final(v_dr):
