@@ -68,17 +68,17 @@ DERIVATIVES = {
 }
 
 
-def table(rows: list[Row]) -> str:
-    lines = [
-        "| model | derivative | equations | compile [s] | seconds | steps a lane | events a lane |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    lines += [
+HEAD = (
+    "| model | derivative | equations | compile [s] | seconds | steps a lane | events a lane |\n"
+    "|---|---|---|---|---|---|---|"
+)
+
+
+def line(r: Row) -> str:
+    return (
         f"| {r.model} | {r.derivative} | {r.equations} | {r.compile_seconds:.1f} | {r.seconds:.3g} | {r.steps:.0f} "
         f"| {r.events:.0f} |"
-        for r in rows
-    ]
-    return "\n".join(lines)
+    )
 
 
 def main() -> None:
@@ -90,6 +90,7 @@ def main() -> None:
     args = parser.parse_args()
     starts = Motion(jnp.linspace(0.0, 1.0, args.lanes), jnp.linspace(-0.5, 0.1, args.lanes))
     rows = []
+    print(HEAD)
     for derivative, transform in DERIVATIVES.items():
         for model, lane in MODELS.items():
             fn = transform(lane)
@@ -104,7 +105,7 @@ def main() -> None:
                     float(np.mean(steps)), float(np.mean(events)),
                 )
             )  # fmt: skip
-    print(table(rows))
+            print(line(rows[-1]), flush=True)
     if args.out:
         with open(args.out, "w") as file:
             json.dump({"machine": machine(), "lanes": args.lanes, "rows": [r._asdict() for r in rows]}, file, indent=1)

@@ -150,14 +150,14 @@ def picture(rows: list[Row]) -> plt.Figure:
     return figure
 
 
-def table(rows: list[Row]) -> str:
-    lines = ["| what grows | | lanes | seconds | compile [s] | memory a lane [kB] |", "|---|---|---|---|---|---|"]
-    lines += [
+HEAD = "| what grows | | lanes | seconds | compile [s] | memory a lane [kB] |\n|---|---|---|---|---|---|"
+
+
+def line(r: Row) -> str:
+    return (
         f"| {r.panel} = {r.x} | {r.line} | {r.lanes} | {r.seconds:.3g} | {r.compile_seconds:.1f} "
         f"| {r.bytes / r.lanes / 1e3:.3g} |"
-        for r in rows
-    ]
-    return "\n".join(lines)
+    )
 
 
 def main() -> None:
@@ -168,10 +168,11 @@ def main() -> None:
     parser.add_argument("--out", help="where to write the numbers and the picture")
     args = parser.parse_args()
     rows = []
+    print(HEAD)
     for panel in args.panels:
-        here = [measured(panel, *case, repeats=args.repeats) for case in PANELS[panel].cases()]
-        print(f"\n{table(here)}", flush=True)
-        rows += here
+        for case in PANELS[panel].cases():
+            rows.append(measured(panel, *case, repeats=args.repeats))
+            print(line(rows[-1]), flush=True)
     if args.out:
         picture(rows).savefig(f"{args.out}.png", dpi=120)
         with open(f"{args.out}.json", "w") as file:
