@@ -131,8 +131,18 @@ def table(rows: list[Measured]) -> str:
     return "\n".join(lines)
 
 
+def processor() -> str:
+    """Its name, as far as the system tells."""
+    try:
+        with open("/proc/cpuinfo") as file:
+            names = [line.partition(":")[2].strip() for line in file if line.startswith("model name")]
+    except OSError:
+        names = []
+    return names[0] if names else platform.processor() or platform.machine()
+
+
 def machine() -> dict[str, Any]:
-    found = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
+    found = {"processor": processor(), "cores": os.cpu_count(), "python": platform.python_version()}
     for package in ("jax", "jaxlib", "diffrax", "optimistix", "equinox", "scipy", "numpy", "heyoka"):
         try:
             found[package] = version(package)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import Free, Ticks
 
 import nsjax
 from nsjax.gallery import Motion, StickSlip
@@ -17,28 +18,6 @@ jax.config.update("jax_enable_x64", True)
 pytestmark = pytest.mark.benchmark
 LANES = 4096
 TOLERANCES = diffrax.PIDController(rtol=1e-8, atol=1e-8)
-
-
-class Smooth(nsjax.System):
-    """The oscillator of section 3.4 without its belt."""
-
-    k: float = 1.0
-
-    def vector_field(self, t, y, s):
-        return Motion(y.v, -self.k * y.x)
-
-
-class Ticks(nsjax.System):
-    """Crosses a surface `rate` times a unit of time, with nothing else to do."""
-
-    rate: float = 10.0
-
-    def vector_field(self, t, y, s):
-        return self.rate + 0 * y * s.tick
-
-    @nsjax.sgn
-    def tick(self, t, y):
-        return jnp.sin(jnp.pi * y)
 
 
 def sweep(system, y0, t1, values, **kwargs):
@@ -57,7 +36,7 @@ def test_throughput(benchmark, model, solver):
     """Lane-steps a second, with and without a switch."""
     values = jnp.linspace(0.1, 1.0, LANES)
     if model == "smooth":
-        run, values = sweep(lambda v: Smooth(), lambda v: Motion(2.0, v), 100.0, values, solver=solver)
+        run, values = sweep(lambda v: Free(), lambda v: Motion(2.0, v), 100.0, values, solver=solver)
     else:
         run, values = sweep(lambda v: StickSlip(v_dr=v), lambda v: Motion(2.5, -0.5), 100.0, values, solver=solver)
     compiled = run.lower(values).compile()

@@ -18,6 +18,7 @@ from ._solution import (
     Solution as Solution,
 )
 from ._solve import solve as solve
+from ._sweep import sweep as sweep
 from ._system import impact as impact, relay as relay, sgn as sgn, System as System
 from ._taylor import Taylor as Taylor
 from ._variational import fundamental_matrix as fundamental_matrix

@@ -43,6 +43,21 @@ class Rubbing(nsjax.System):
         return y.v
 
 
+class Hitting(Rubbing):
+    """The same with a wall."""
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - s.rub - s.wall)
+
+    @nsjax.impact
+    def wall(self, t, y):
+        return 2 - y.x
+
+    @wall.restitution
+    def wall(self):
+        return 0.5
+
+
 class Bent(Rubbing):
     """The same, with a surface that is not affine."""
 
@@ -75,10 +90,10 @@ def count(jaxpr, into=None):
     return into
 
 
-def primitives(system, **kwargs):
+def primitives(system, derivative=lambda fn: fn, **kwargs):
     kwargs = dict(solver=dfx.Heun(), stepsize_controller=dfx.ConstantStepSize(), dt0=0.1, throw=False) | kwargs
-    closed = jax.make_jaxpr(lambda y: solve(system, 0.0, 1.0, y, **kwargs).y1)(Motion(jnp.ones(()), jnp.ones(())))
-    return count(closed.jaxpr)
+    flow = derivative(lambda y: solve(system, 0.0, 1.0, y, **kwargs).y1)
+    return count(jax.make_jaxpr(flow)(Motion(jnp.ones(()), jnp.ones(()))).jaxpr)
 
 
 def total(counter):
@@ -90,15 +105,31 @@ def free():
     return primitives(Free())
 
 
+EVENT_CODE = ("compact_cond", "cond", "scan", "lu", "sort", "argmax", "argmin", "top_k", "custom_linear_solve")
+
+
 def test_without_switches_no_event_code(free):
     """One loop, no branch, no search for roots, no linear algebra."""
     assert free["while"] == 1
-    for name in ("compact_cond", "cond", "scan", "lu", "sort", "argmax", "argmin", "top_k", "custom_linear_solve"):
+    for name in EVENT_CODE:
         assert free[name] == 0, name
     one = primitives(Crossing())
     assert one["compact_cond"] >= 1 and one["while"] > 1
     print(total(free), total(one), total(primitives(Rubbing())))
     assert total(free) < total(one) / 3
+
+
+def test_each_declaration_adds_its_own(free):
+    """No switch, `sgn`, `sgn` and `impact`: no linear system for one multiplier, and derivatives where asked for, which
+    add less than the program itself. (`benchmarks/cost.py` has the seconds.)"""
+    programs = {system: (primitives(system()), primitives(system(), jax.jacfwd)) for system in (Free, Rubbing, Hitting)}
+    print({system.__name__: tuple(map(total, both)) for system, both in programs.items()})
+    for plain, derived in programs.values():
+        assert total(plain) < total(derived) < 2 * total(plain)
+    for less, more in ((Free, Rubbing), (Rubbing, Hitting)):
+        assert all(2 * total(a) < total(b) for a, b in zip(programs[less], programs[more]))
+    assert all(program[name] == 0 for program in programs[Free] for name in EVENT_CODE)
+    assert all(program["lu"] == 0 for program in programs[Rubbing])
 
 
 def test_no_multiplier_where_nothing_slides():

@@ -38,6 +38,7 @@ ORDER = (
     "_variational",
     "_regularise",
     "_orbit",
+    "_sweep",
     "_work_precision",
     "gallery",
     "plot",

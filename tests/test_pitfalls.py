@@ -507,3 +507,69 @@ def test_states_that_are_not_real_numbers(case):
     y0 = {"complex": Point(jnp.asarray(1j)), "integer": Point(jnp.asarray(1)), "empty": ()}[case]
     with pytest.raises((TypeError, ValueError), match="Argument `y0` must"):
         solve(Root(), 0.0, 1.0, y0)
+
+
+# Two changes of a periodic orbit between two values of a parameter.
+
+
+class Galloping(gallery.DiscontinuousSupport):
+    """The mass of section 3.5 in a wind whose damping c is negative beyond a certain speed."""
+
+    c: float = 0.0
+
+    def vector_field(self, t, y, s):
+        still = super().vector_field(t, y, s)
+        return Motion(y.v, still.v - self.c * y.v / self.m)
+
+
+@pytest.mark.slow
+def test_bifurcation_and_corner_in_one_step():
+    """Pitfall 25, for as long as there is no continuation: a Neimark-Sacker bifurcation at wind speed 1 and a corner at
+    1.2, where the growing orbit reaches the tip of the support. Bisection on what an orbit reports finds both."""
+    omega, corner = 1.2, 1.2
+
+    def damping(speed):
+        return (1 - speed) / 2
+
+    def free(speed):
+        """Complex amplitude of the motion without contact, under a force of amplitude speed²."""
+        return speed**2 / (1 - omega**2 + 1j * damping(speed) * omega)
+
+    def at(speed):
+        system = Galloping(c=damping(speed), f_0=speed**2, omega=omega, x_c=abs(free(corner)))
+        amplitude, tight = free(speed), dfx.PIDController(rtol=1e-12, atol=1e-12)
+        guess = Motion(amplitude.real, -omega * amplitude.imag)
+        limits = dict(solver=dfx.Tsit5(), stepsize_controller=tight, max_events=8)
+        return speed, nsjax.find_orbit(system, guess, **limits)
+
+    def changes(low, high):
+        """(the orbits on both sides, whether it is a corner) of every change that the ends of an interval tell of."""
+        (a, before), (b, after) = low, high
+        same = bool(before.itinerary.same_as(after.itinerary))
+        if same and before.stable == after.stable:
+            return []
+        if b - a < 1e-8:
+            return [(low, high, not same)]
+        middle = at((a + b) / 2)
+        return changes(low, middle) + changes(middle, high)
+
+    smooth, tip = changes(at(0.95), at(1.201))
+
+    (a, before), (b, after), is_corner = smooth
+    assert not is_corner and a < 1 + 1e-9 and b > 1 - 1e-9
+    assert before.stable and not after.stable and len(after.events) == 0
+    np.testing.assert_allclose(before.multipliers, after.multipliers, atol=1e-6)
+
+    (a, before), (b, after), is_corner = tip
+    assert is_corner and a < corner + 1e-9 and b > corner - 1e-9
+    assert not before.stable and not after.stable
+    assert list(before.itinerary) == [{"support": -1}]
+    assert list(after.itinerary) == [{"support": -1}, {"support": 1}, {"support": -1}]
+    # At the tip the damper c_f sets in: the saltation matrix (3.30) of entering, while leaving adds nothing. Its
+    # determinant is 1, so that the multipliers jump along a circle, of which `stable` says nothing.
+    period = expm(np.array([[0, 1], [-1, -damping(corner)]]) * 2 * np.pi / omega)
+    entering = np.array([[1, 0], [-after.system.c_f, 1]])
+    for orbit, monodromy in ((before, period), (after, period @ entering)):
+        found, exact = (np.sort_complex(np.asarray(m)) for m in (orbit.multipliers, np.linalg.eigvals(monodromy)))
+        np.testing.assert_allclose(found, exact, atol=1e-3)
+    assert abs(before.multipliers[0] - after.multipliers[0]) > 0.3
