@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._crossing import bend, deflate, first_root, largest
 from ._filippov import Model, State
+from ._linear import linear_solve
 from ._once import once
 from ._settle import settle
 from ._solution import RESULTS
@@ -177,10 +178,10 @@ def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> tuple[Y, Y]:
             held = takes_part
             for _ in which[1:]:
                 square = jnp.where(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
-                p = jnp.linalg.solve(square, jnp.where(held, want, 0))
+                p = linear_solve(square, jnp.where(held, want, 0))
                 held = held & ((p >= 0) | (jnp.arange(len(which)) == 0))  # no contact pulls
             square = jnp.where(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
-            impulses = list(jnp.linalg.solve(square, jnp.where(held, want, 0)))
+            impulses = list(linear_solve(square, jnp.where(held, want, 0)))
         out, size = y, jax.tree.map(jnp.abs, y)
         for p, direction in zip(impulses, pushes):
             out = jax.tree.map(lambda a, b, p=p: a + p * b, out, direction)

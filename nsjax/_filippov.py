@@ -15,6 +15,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ._linear import linear_solve
 from ._structure import is_affine, is_constant
 from ._system import AbstractSwitch, impact, relay, sgn, System
 from ._types import Mode, Scalar, Y
@@ -190,7 +191,7 @@ class Model(eqx.Module):
 
         def newton(_: Any, sigma: Float[Array, " m"]) -> Float[Array, " m"]:
             r, slope = self.linear(t, y, state, put(sigma))
-            return sigma + jnp.linalg.solve(jnp.where(held[:, None], slope, eye), jnp.where(held, -r, 0))
+            return sigma + linear_solve(jnp.where(held[:, None], slope, eye), jnp.where(held, -r, 0))
 
         sigma = jnp.stack([s[k] for k in which])
         if self.jointly_affine:
@@ -222,7 +223,7 @@ class Model(eqx.Module):
         def push(y: Y, gaps: list[Scalar]) -> Y:
             """∂f/∂s times the values which close the gaps."""
             gap = jnp.where(held, jnp.stack(gaps), 0)
-            move = -gap / slope[0] if len(which) == 1 else jnp.linalg.solve(slope, -gap)
+            move = -gap / slope[0] if len(which) == 1 else linear_solve(slope, -gap)
             ds = [jnp.zeros_like(v) for v in s]
             for i, k in enumerate(which):
                 ds[k] = jnp.where(held[i], move[i], 0)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from ._crossing import binomials
 from ._filippov import Model, State
+from ._linear import linear_solve
 from ._series import Coefficient, Series
 from ._step import jittered, Step, Stepper, unresolved, Watch, with_multipliers
 from ._types import Scalar, Y
@@ -178,7 +179,8 @@ class TaylorStepper(Stepper):
             held = [model.held(k, state.mode[k]) for k in which]
             _, slope = model.linear(t, y, state, s)
             slope = jnp.where(jnp.stack(held)[:, None], slope, jnp.eye(len(which), dtype=t.dtype))
-            inverse = 1 / slope if len(which) == 1 else jnp.linalg.inv(slope)
+            columns = jax.vmap(linear_solve, in_axes=(None, 0))(slope, jnp.eye(len(which), dtype=t.dtype))
+            inverse = 1 / slope if len(which) == 1 else columns.T
 
         def fn(t: Scalar, *args: Array) -> list[Array]:
             y, s = jax.tree.unflatten(tree, args[: len(leaves)]), self.values(model, state, t, args[len(leaves) :])

@@ -14,6 +14,7 @@ PACKAGE = pathlib.Path(__file__).parents[1] / "nsjax"
 ORDER = (
     "_types",
     "_once",
+    "_linear",
     "_structure",
     "_system",
     "_compact",

@@ -1,0 +1,31 @@
+"""Small systems of linear equations."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._types import Scalar
+
+
+def linear_solve(a: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+    """x with a x = b.
+
+    Up to three unknowns by Cramer's rule, which XLA vectorises over the lanes of a batch, where it would call LAPACK for
+    each of them. (Sweeps with two multipliers take a fourteenth of the time, with three a sixth. Elimination written out
+    takes twice as long to compile and run, and with five is no faster than LAPACK.) Scaling rows or columns does not
+    matter to it.
+    """
+    m = len(b)
+    if m > 3:
+        return jnp.linalg.solve(a, b)
+    columns = [[a[i, j] for i in range(m)] for j in range(m)]
+    right = [b[i] for i in range(m)]
+    whole = _determinant(columns)
+    return jnp.stack([_determinant([*columns[:j], right, *columns[j + 1 :]]) / whole for j in range(m)])
+
+
+def _determinant(columns: list[list[Array]]) -> Scalar:
+    first, *others = columns
+    if not others:
+        return first[0]
+    minors = [_determinant([c[:i] + c[i + 1 :] for c in others]) for i in range(len(first))]
+    return sum((x * m * (-1) ** i for i, (x, m) in enumerate(zip(first[1:], minors[1:]), 1)), first[0] * minors[0])
