@@ -80,9 +80,8 @@ class Exponential(dfx.AbstractAdaptiveSolver):
 
         t0 = jnp.asarray(t0, jnp.result_type(*jax.tree.leaves(y0)))
         _check_affine(field, t0, y0, "the vector field")
-        ys, error, fits = _sampled(field, t0, jnp.asarray(t1 - t0, t0.dtype), y0, field(t0, y0))
-        # In units of the tolerance that is asked for, an unresolved step has a large error.
-        error = jax.tree.map(lambda y, e: jnp.where(fits, e * jnp.abs(y), jnp.nan), y0, error)
+        ys, error, _, fits = _sampled(field, t0, jnp.asarray(t1 - t0, t0.dtype), y0, field(t0, y0))
+        error = jax.tree.map(lambda e: jnp.where(fits, e, jnp.nan), error)
         y1 = ys[-1]
         return y1, error, dict(y0=y0, points=stack(_control_points(ys))), None, dfx.RESULTS.successful
 
@@ -171,9 +170,11 @@ def expm(m: Square) -> Square:
     return lax.while_loop(lambda c: c[0] < count, lambda c: (c[0] + 1, c[1] @ c[1]), (jnp.zeros_like(count), total))[1]
 
 
-def _sampled(field: Callable[[Scalar, Y], Y], t: Scalar, dt: Scalar, y: Y, f: Y) -> tuple[list[Y], Y, Bool[Array, ""]]:
-    """The states at equal parts of a step, both ends included; what a polynomial through them misses of the state's
-    size, leaf by leaf, in units of what is allowed; and whether the forcing is of the kind that is known."""
+def _sampled(
+    field: Callable[[Scalar, Y], Y], t: Scalar, dt: Scalar, y: Y, f: Y
+) -> tuple[list[Y], Y, Scalar, Bool[Array, ""]]:
+    """The states at equal parts of a step, both ends included; what a polynomial through them misses, and how many
+    times what may be missed that is; and whether the forcing is of a kind that is known."""
     x, unravel = jfu.ravel_pytree(y)
 
     def flat(t: Scalar, x: Flat) -> Flat:
@@ -197,8 +198,9 @@ def _sampled(field: Callable[[Scalar, Y], Y], t: Scalar, dt: Scalar, y: Y, f: Y)
     size = jnp.max(jnp.abs(lax.stop_gradient(x) + frozen), axis=0)
     terms = lax.stop_gradient(jnp.abs(whole) @ jnp.max(jnp.abs(jnp.stack(z)), axis=0))[: len(x)] * jnp.abs(scale)
     allowed = max(1e-9, 1e4 * eps) * size + 64 * _N * eps * (terms + size)
-    error = jnp.maximum(tail, 100 * missed) / jnp.where(allowed > 0, allowed, 1)
-    return [unravel(x + move) for move in moves], unravel(error), fits
+    error = jnp.maximum(tail, 100 * missed)
+    excess = jnp.max(error / jnp.where(allowed > 0, allowed, 1))
+    return [unravel(x + move) for move in moves], unravel(error), excess, fits
 
 
 def _control_points(ys: list[Y]) -> list[Y]:
@@ -229,10 +231,10 @@ class ExponentialStepper(Stepper):
     def __call__(
         self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watch | None = None
     ) -> Step:
-        ys, error, fits = _sampled(lambda t, y: model.flow(t, y, state), t, t_next - t, y, f0)
+        ys, _, excess, fits = _sampled(lambda t, y: model.flow(t, y, state), t, t_next - t, y, f0)
         if not self.slides:
             fits = fits & ~ft.reduce(jnp.logical_or, [model.held(k, state.mode[k]) for k in model.holdable])
-        step = Step(t_next, ys[-1], error, ys, fits=fits)
+        step = Step(t_next, ys[-1], excess, ys, fits=fits)
         if watch is None or not model.slots:
             return step
         ts = t + (t_next - t) * jnp.asarray(nodes(_N, even=True), t.dtype)
@@ -257,18 +259,18 @@ class ExponentialStepper(Stepper):
                 # so short that the guard is small all along.
                 error, dense = blur * size + tail, finer @ values
                 sag = jnp.pad(jnp.abs(dense[2:] - 2 * dense[1:-1] + dense[:-2]) / 8, 1, mode="edge")  # between points
-                touches = (jnp.min(dense - sag) <= error) & (jnp.min(dense) > -error) & (roots == 0)
-                resolved = resolved & ~touches
+                touches = (jnp.min(dense - sag) <= error) & (jnp.min(dense) > -error)
+                resolved = resolved & ~(touches & (roots == 0) & (size > slack))
         return step._replace(guards=guards, noise=lax.stop_gradient(with_multipliers(model, noise)), resolved=resolved)
 
     def points(self, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
         return _control_points(ks)
 
     def pace(self, controller: Any, step: Step, t: Scalar, y: Y, length: Scalar) -> Any:
-        error = ft.reduce(jnp.maximum, [jnp.max(e) for e in jax.tree.leaves(step.error)])
-        keep = error <= 1
+        excess: Any = step.error
+        keep = excess <= 1
         # What a polynomial misses grows with the power `_N` of the step.
-        factor = 0.8 * jnp.where(error > 0, error, 1e-30) ** (-1 / _N)
+        factor = 0.8 * jnp.where(excess > 0, excess, 1e-30) ** (-1 / _N)
         dt = (step.t_next - t) * jnp.clip(jnp.where(jnp.isnan(factor), 0.1, factor), 0.05, 10)
         most = getattr(controller, "dtmax", None)
         return keep, jnp.minimum(dt, length if most is None else most)

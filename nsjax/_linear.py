@@ -9,10 +9,10 @@ from ._types import Scalar
 def linear_solve(a: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
     """x with a x = b.
 
-    Up to three unknowns by Cramer's rule, which XLA vectorises over the lanes of a batch, where it would call LAPACK for
-    each of them. (Sweeps with two multipliers take a fourteenth of the time, with three a sixth. Elimination written out
-    takes twice as long to compile and run, and with five is no faster than LAPACK.) Scaling rows or columns does not
-    matter to it.
+    Up to three unknowns by Cramer's rule, which XLA vectorises over the lanes of a batch, where it would call LAPACK
+    for each. (Sweeps with two multipliers take a fourteenth of the time, with three a sixth. Elimination written out
+    takes twice as long to compile and run, and with five is no faster than LAPACK.) Scaling rows or columns is no
+    matter.
     """
     m = len(b)
     if m > 3:
