@@ -114,6 +114,7 @@ class Learned(nsjax.System):
         return y.v - self.v_dr
 
 
+@pytest.mark.slow
 def test_many_parameters():
     """A network's friction law is fitted to a trajectory with stick phases: the loss falls a hundredfold."""
     ts = jnp.linspace(0.5, 10.0, 20)

@@ -115,6 +115,7 @@ def test_start_beside_the_surface():
         assert np.all(np.abs(jax.jacfwd(end)(0.2, dt0)) < 1e-15)
 
 
+@pytest.mark.slow
 def test_derivative_with_an_implicit_solver():
     """In forward mode, as the solver comes."""
     run = dict(stepsize_controller=pid(1e-10), max_steps=20_000)

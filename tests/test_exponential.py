@@ -202,7 +202,7 @@ def test_roots_next_to_each_other(depth):
 AFFINE = ("1.1(1)", "1.1(2)", "1.1(3)", "(2.3)", "example 2.1", "example 2.2", "(2.26)", "(2.28)", "3.4", "6.6")
 
 
-@pytest.mark.parametrize("key", [pytest.param(k, marks=[pytest.mark.slow] * (k != "6.6")) for k in AFFINE])
+@pytest.mark.parametrize("key", [pytest.param(k, marks=pytest.mark.slow) for k in AFFINE])
 def test_gallery(key):
     """Every system whose modes are affine, against Dopri8."""
     entry = gallery.THESIS[key]

@@ -176,7 +176,7 @@ def told_but_ambiguous(tally: collections.Counter) -> int:
     return tally["needlessly told"] - tally["needlessly told ambiguous"]
 
 
-@pytest.mark.parametrize("name", ["friction", "corners", "relays", "rest"])
+@pytest.mark.parametrize("name", ["friction", "corners", "relays"])
 def test_random_systems(name):
     tally, wrong = fuzz(name, 80, 0, derive=name == "friction")
     assert not wrong

@@ -83,6 +83,7 @@ def test_section_2_4():
     check_stick_slip(orbit, reference.friction_curve_orbit())
 
 
+@pytest.mark.slow
 def test_section_3_5():
     """A forced orbit over a surface with a corner; its base point is at t0, as asked for."""
     system = gallery.DiscontinuousSupport()

@@ -146,7 +146,10 @@ def racket(e, a):
     return np.array([[-r, 0], [(1 + r) * pull / before, -r]])
 
 
-@pytest.mark.parametrize("case", CASES)
+LONG = ("impact", "(6.21) a")  # to compile: of impacts and of tuple-valued h others stay
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, marks=[pytest.mark.slow] * (c in LONG)) for c in CASES])
 def test_three_ways(case):
     """Formula, autodiff and differences across the events against their exact product. Pitfall 19: exact to 1e-8 and not
     only to the accuracy of an interpolant."""

@@ -158,6 +158,7 @@ def end(v, solver):
     return jnp.stack(solve(gallery.StickSlip(v_dr=v), 0.0, 20.0, Motion(2.5, -0.5), solver=solver, **TIGHT).y1)
 
 
+@pytest.mark.slow
 def test_derivative():
     value, slope = jax.jit(lambda v: (end(v, Taylor()), jax.jacfwd(end)(v, Taylor())))(0.5)
     np.testing.assert_allclose(value, reference.stick_slip_final(np.array([0.5]), 20.0)[0], atol=1e-12)
