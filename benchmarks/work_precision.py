@@ -18,7 +18,7 @@ import matplotlib.pyplot as plt
 from sweep import Hammer, machine
 
 import nsjax
-from nsjax import gallery, Method, Taylor
+from nsjax import Exponential, gallery, Method, Taylor
 from nsjax.gallery import Motion
 
 
@@ -45,6 +45,8 @@ def methods(key: str) -> dict[str, Method]:
         "events, Dopri8": Method(dfx.Dopri8()),
         "events, Taylor": Method(Taylor()),
     }
+    if key in ("3.4", "6.6", "hammer"):  # affine in the state
+        found["events, Exponential"] = Method(Exponential())
     if key == "2.4":
         for eps in (1e4, 1e6):
             found[f"arctan, ε = {eps:.0e}"] = Method(dfx.Kvaerno5(), lambda s, eps=eps: nsjax.smoothed(s, eps))

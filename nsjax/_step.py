@@ -14,11 +14,11 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
-import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ._compact import compact_cond
 from ._crossing import binomials, nodes, to_bernstein, to_chebyshev
 from ._filippov import Model, State
 from ._once import once
@@ -168,7 +168,7 @@ class RungeKutta(Stepper):
         step = self.step(model, state, t, t_next, y, f0)
         if watch is None or not model.slots:
             return step
-        return self.watched(model, state, watch.affine, t, y, step)
+        return step._replace(**self.watched(model, state, watch.affine, t, y, step))
 
     def step(self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y) -> Step:
         def f(t: Scalar, y: Y) -> Y:
@@ -219,41 +219,64 @@ class RungeKutta(Stepper):
     def points(self, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
         return self._weighted(to_bernstein(self.degree) @ self._values(nodes(self.degree)), y, y1, ks)
 
-    def watched(self, model: Model, state: State, affine: tuple[bool, ...], t: Scalar, y: Y, step: Step) -> Step:
-        """A step with Bernstein coefficients `[slot][part][j]` of the guards along it."""
+    def watched(
+        self, model: Model, state: State, affine: tuple[bool, ...], t: Scalar, y: Y, step: Step
+    ) -> dict[str, Any]:
+        """Bernstein coefficients `[slot][part][j]` of the guards along a step, and what belongs to them."""
+        model, state, t, y, step = frozen((model, state, t, y, step))
         near = jittered(model, state, t, y)
         noise: list[list[Scalar]] = [[] for _ in affine]
         out: list[list[list[Scalar]]] = [[] for _ in affine]
         resolved = jnp.ones((), bool)
-        dt = step.t_next - t
-
-        def sampled(at: list[float], points: list[Y], wanted: tuple[bool, ...]) -> list[tuple[int, list[Scalar]]]:
-            """(slot, values along the step) for every part of the guards that are wanted."""
-            if len(model.holdable) > 1:  # the multipliers of all points by one call of the linear solver
-                ts = t + dt * jnp.asarray(at, t.dtype)
-                batch = jax.vmap(lambda t, y: model.guards(t, y, state, wanted))(ts, stack(points))
-                rows = [jax.tree.map(lambda x, j=j: x[j], batch) for j in range(len(at))]
-            else:
-                rows = [model.guards(t + dt * u, y, state, wanted) for u, y in zip(at, points)]
-            return [(i, list(part)) for i, _ in enumerate(wanted) for part in zip(*[row[i] for row in rows])]
-
         if any(affine):
             n = self.degree
-            for i, values in sampled([j / n for j in range(n + 1)], self.points(y, step.y1, step.ks), affine):
+            points = self.points(y, step.y1, step.ks)
+            for i, values in _sampled(model, state, t, step, [j / n for j in range(n + 1)], points, affine):
                 noise[i].append(jnp.abs(near[i][len(out[i])] - values[0]))
                 out[i].append(values)
         if not all(affine):
             n = max(8, self.degree + 3)
             others = tuple(not each for each in affine)
-            points = self._weighted(self._values(nodes(n)), y, step.y1, step.ks)
-            for i, values in sampled([*map(float, nodes(n))], points, others):
-                v = jnp.stack(values)
-                tail = jnp.max(jnp.abs(jnp.asarray(to_chebyshev(n)[-2:], t.dtype) @ v))
+
+            def curved(model: Model, state: State, t: Scalar, y: Y, step: Step) -> list[list[Scalar]]:
+                points = self._weighted(self._values(nodes(n)), y, step.y1, step.ks)
+                return [v for _, v in _sampled(model, state, t, step, [*map(float, nodes(n))], points, others)]
+
+            which = [i for i, other in enumerate(others) if other for _ in near[i]]
+            if all(model.slots[i].holding for i in which):
+                # Multipliers are not asked for where nothing is held, as in free flight between impacts.
+                held = [model.held(model.slots[i].switch, state.mode[model.slots[i].switch]) for i in which]
+                dynamic, static = eqx.partition((model, state, t, y, step), eqx.is_array)
+                free = [[jnp.ones_like(t)] * (n + 1)] * len(which)
+                rows = compact_cond(
+                    ft.reduce(jnp.logical_or, held), lambda d: curved(*eqx.combine(d, static)), (dynamic,), free
+                )
+            else:
+                rows = curved(model, state, t, y, step)
+            for i, values in zip(which, rows):
+                # (Not by `jnp.max` of an array: XLA's code for that takes as long as all stages of a step.)
+                last = [sum(float(w) * v for w, v in zip(row, values)) for row in to_chebyshev(n)[-2:]]
+                tail, size = (ft.reduce(jnp.maximum, map(jnp.abs, x)) for x in (last, values))
                 # Shortly after a double root or a lift-off all of it is rounding, which a shorter step would not mend.
                 noise[i].append(jnp.abs(near[i][len(out[i])] - values[0]))
-                resolved = resolved & ~(tail > unresolved(t.dtype) * jnp.max(jnp.abs(v)) + noise[i][-1])
-                out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ v))
-        return step._replace(guards=out, noise=lax.stop_gradient(with_multipliers(model, noise)), resolved=resolved)
+                rough = once(tail - unresolved(t.dtype) * size - noise[i][-1])
+                resolved = resolved & ~(rough > 0)
+                out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ jnp.stack(values)))
+        return dict(guards=out, noise=with_multipliers(model, noise), resolved=resolved)
+
+
+def _sampled(
+    model: Model, state: State, t: Scalar, step: Step, at: list[float], points: list[Y], wanted: tuple[bool, ...]
+) -> list[tuple[int, list[Scalar]]]:
+    """(slot, values along the step) for every part of the guards that are wanted."""
+    dt = step.t_next - t
+    if len(model.holdable) > 1:  # the multipliers of all points by one call of the linear solver
+        ts = t + dt * jnp.asarray(at, t.dtype)
+        batch = jax.vmap(lambda t, y: model.guards(t, y, state, wanted))(ts, stack(points))
+        rows = [jax.tree.map(lambda x, j=j: x[j], batch) for j in range(len(at))]
+    else:
+        rows = [model.guards(t + dt * u, y, state, wanted) for u, y in zip(at, points)]
+    return [(i, list(part)) for i, _ in enumerate(wanted) for part in zip(*[row[i] for row in rows])]
 
 
 def unresolved(dtype: Any) -> float:
