@@ -136,10 +136,15 @@ def _generator(
         one, zero = jnp.ones_like(t), jnp.zeros_like(t)
         clock = jnp.stack([jnp.stack(row) for row in ([zero] * 3, [one, zero, -squared * dt**2], [zero, one, zero])])
     right = jnp.stack(columns, axis=1)
-    scale = lax.stop_gradient(jnp.max(jnp.abs(right)))
+    scale = lax.stop_gradient(_largest([_largest(column) for column in columns]))
     scale = jnp.where(scale > 0, scale, 1)
     below = jnp.zeros((len(columns), len(x)), t.dtype)
     return jnp.block([[matrix, right / scale], [below, clock]]), scale, fits
+
+
+def _largest(rows: Any) -> Any:
+    """The largest absolute value among the rows. (XLA's code for the maximum along an axis takes as long as a step.)"""
+    return ft.reduce(jnp.maximum, [jnp.abs(row) for row in rows])
 
 
 def expm(m: Square) -> Square:
@@ -154,7 +159,7 @@ def expm(m: Square) -> Square:
     m3, m4 = m2 @ m, m2 @ m2
 
     def norm(p: Square) -> Scalar:
-        return jnp.max(jnp.sum(jnp.abs(lax.stop_gradient(p)), axis=0))
+        return _largest([sum(jnp.abs(x) for x in column) for column in lax.stop_gradient(p).T])
 
     size = jnp.maximum(norm(m2) ** (1 / 2), norm(m3) ** (1 / 3)) / _NEAR
     halvings = jnp.ceil(jnp.log2(jnp.where((size > 1) & jnp.isfinite(size), size, 1)))
@@ -193,13 +198,13 @@ def _sampled(
     frozen, eps = lax.stop_gradient(moves), float(jnp.finfo(x.dtype).eps)
     chebyshev = to_chebyshev(_N, even=True)
     halfway = np.polynomial.chebyshev.chebvander([1 / _N], _N)[0] @ chebyshev
-    tail = jnp.max(jnp.abs(jnp.asarray(chebyshev[-2:], x.dtype) @ frozen), axis=0)
+    tail = _largest(jnp.asarray(chebyshev[-2:], x.dtype) @ frozen)
     missed = jnp.abs(jnp.asarray(halfway, x.dtype) @ frozen - lax.stop_gradient(between))
-    size = jnp.max(jnp.abs(lax.stop_gradient(x) + frozen), axis=0)
-    terms = lax.stop_gradient(jnp.abs(whole) @ jnp.max(jnp.abs(jnp.stack(z)), axis=0))[: len(x)] * jnp.abs(scale)
+    size = _largest(lax.stop_gradient(x) + frozen)
+    terms = lax.stop_gradient(jnp.abs(whole) @ _largest(z))[: len(x)] * jnp.abs(scale)
     allowed = max(1e-9, 1e4 * eps) * size + 64 * _N * eps * (terms + size)
     error = jnp.maximum(tail, 100 * missed)
-    excess = jnp.max(error / jnp.where(allowed > 0, allowed, 1))
+    excess = once(_largest(error / jnp.where(allowed > 0, allowed, 1)))
     return [unravel(x + move) for move in moves], unravel(error), excess, fits
 
 
@@ -252,15 +257,17 @@ class ExponentialStepper(Stepper):
             guards.append([list(jnp.asarray(matrix, t.dtype) @ values) for values in row])
             noise.append([jnp.abs(other - values[0]) for other, values in zip(others, row)])
             for values, slack, roots in zip(row, noise[-1], known):
-                size, tail = jnp.max(jnp.abs(values)), jnp.max(jnp.abs(last @ values))
+                size, tail = _largest(values), _largest(last @ values)
                 if not affine:
                     resolved = resolved & ~(tail > unresolved(t.dtype) * size + slack)
                 # The error of the coefficients hides a near miss, and two roots close to each other, until the step is
                 # so short that the guard is small all along.
-                error, dense = blur * size + tail, finer @ values
-                sag = jnp.pad(jnp.abs(dense[2:] - 2 * dense[1:-1] + dense[:-2]) / 8, 1, mode="edge")  # between points
-                touches = (jnp.min(dense - sag) <= error) & (jnp.min(dense) > -error)
+                error, dense = once(blur * size + tail), list(finer @ values)
+                sag = [jnp.abs(a - 2 * b + c) / 8 for a, b, c in zip(dense, dense[1:], dense[2:])]  # between points
+                dips = [b - s for b, s in zip(dense, [sag[0], *sag, sag[-1]])]
+                touches = (ft.reduce(jnp.minimum, dips) <= error) & (ft.reduce(jnp.minimum, dense) > -error)
                 resolved = resolved & ~(touches & (roots == 0) & (size > slack))
+        resolved = once(jnp.where(resolved, 1.0, 0.0)) > 0
         return step._replace(guards=guards, noise=lax.stop_gradient(with_multipliers(model, noise)), resolved=resolved)
 
     def points(self, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
