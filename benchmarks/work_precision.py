@@ -60,7 +60,7 @@ def methods(key: str) -> dict[str, Method]:
 
 def quantities(case: Case) -> dict[str, Callable[..., Any]]:
     # A single solution takes little longer than the call of the program: many starts at once.
-    shifts = jnp.linspace(0, 0.01, LANES)
+    shifts = jnp.linspace(-0.01, 0, LANES)  # away from the wall
 
     def moved(system: Any, method: Method, p: Any) -> Any:
         system = eqx.tree_at(lambda s: getattr(s, case.parameter), system, p)

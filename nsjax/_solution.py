@@ -50,6 +50,9 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     nonfinite_field = "The vector field or an indicator function returned a value that is not finite (NaN or infinity)."
     wrong_mode = "Argument `mode` places the start on one side of a surface, but `y0` lies clearly on the other."
+    start_penetrates = (
+        "The start lies beyond an impact surface: h < 0 there. Put `y0` where h >= 0, or change the sign of h."
+    )
     wrong_reset = (
         "A reset left the state on the wrong side of its surface (h < 0), or still approaching it (dh/dt < 0). Check "
         "the signs in the method decorated with `.reset` (or a coefficient of restitution below 0)."

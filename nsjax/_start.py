@@ -36,7 +36,7 @@ def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[St
         parts.append(part.astype(jnp.int32) if model.parts[k] > 1 else None)
         roots.append(zero)
         if isinstance(switch, impact):
-            wrong = h < -noise
+            result = RESULTS.where(h < -noise, RESULTS.start_penetrates, result)
             rests = jnp.zeros((), bool)
             if switch.name in given:
                 if k not in model.contacts:
@@ -45,13 +45,12 @@ def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[St
                         f"(it is a minimum, or `s.{switch.name}` is not a force that acts on d²h/dt²)."
                     )
                 at[k], rests = rests, jnp.asarray(given[switch.name]) == 1
-                wrong = wrong | (rests & (h > 1e6 * noise))
+                result = RESULTS.where(rests & (h > 1e6 * noise), RESULTS.wrong_mode, result)
             elif k in model.contacts:
                 still = State((), tuple(parts), ())
                 (slow,) = model.rounding(lambda t, y, k=k, still=still: (model.level(k, t, y, still),), t, y)
                 at[k] = rests = on[k] & (jnp.abs(model.level(k, t, y, still)) <= slow)
             modes.append(rests.astype(jnp.int32))
-            result = RESULTS.where(wrong, RESULTS.wrong_mode, result)
         elif switch.name in given:
             mode = jnp.asarray(given[switch.name], jnp.int32)
             # A state taken from an earlier solution may carry some drift off its surface.

@@ -294,7 +294,7 @@ def test_reset_to_the_wrong_side():
 
 
 def test_start_beyond_a_wall():
-    assert run(x=0.5) == RESULTS.wrong_mode
+    assert run(x=0.5) == RESULTS.start_penetrates
 
 
 def test_not_finite():

@@ -125,7 +125,7 @@ def test_every_lane_has_its_own_result():
         (RESULTS.max_steps_reached, (1.0, 1.0, 0.0, 1.0, 0.0, 1e4)),
         (RESULTS.nonfinite_field, (np.nan, 0.5, 0.0, 1.0, 0.0, 2.0)),
         (RESULTS.repulsive_sliding, (0.0, 0.5, -1.0, 1.0, 0.0, 2.0)),
-        (RESULTS.wrong_mode, (1.0, 0.5, 0.0, -1.0, 0.0, 2.0)),
+        (RESULTS.start_penetrates, (1.0, 0.5, 0.0, -1.0, 0.0, 2.0)),
         (RESULTS.wrong_reset, (1.0, -0.5, 0.0, 1.0, 0.0, 5.0)),
     ]
 
