@@ -1,8 +1,10 @@
 """nsjax: differentiable piecewise-smooth dynamics in JAX."""
 
 from . import gallery as gallery, plot as plot
+from ._cuts import Segment as Segment
 from ._exponential import Exponential as Exponential
-from ._orbit import find_orbit as find_orbit, Orbit as Orbit
+from ._find_orbit import find_orbit as find_orbit
+from ._orbit import Orbit as Orbit
 from ._regularise import banded as banded, smoothed as smoothed
 from ._saltation import (
     saltation_matrices as saltation_matrices,

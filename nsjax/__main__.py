@@ -12,7 +12,8 @@ import jax
 
 from . import gallery
 from ._cli import draw, Job, load, options, orbit_record, record, report, simulation_record, UsageError
-from ._orbit import find_orbit, Orbit
+from ._find_orbit import find_orbit
+from ._orbit import Orbit
 from ._solution import is_okay, RESULTS, Solution
 from ._solve import solve
 

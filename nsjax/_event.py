@@ -352,7 +352,11 @@ def transversality(model: Model, t: Scalar, y: Y, state: State, slot: Int[Array,
         return model.stacked(model.guards(t, unravel(x), state), -1.0)[slot, part]
 
     h_t, n = jax.grad(guard, argnums=(0, 1))(t, flat)
-    f = jfu.ravel_pytree(model.flow(t, y, state))[0]
+    return cosine(h_t, n, jfu.ravel_pytree(model.flow(t, y, state))[0])
+
+
+def cosine(h_t: Scalar, n: Float[Array, " n"], f: Float[Array, " n"]) -> Scalar:
+    """Between the trajectory and the normal (h_t, n) of a surface."""
     size = (n @ n + h_t**2) * (f @ f + jnp.where(h_t == 0, 0, 1))
     return jnp.abs(n @ f + h_t) / jnp.sqrt(size)
 

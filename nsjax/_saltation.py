@@ -35,7 +35,7 @@ def _modes(system: System, mode: Any) -> tuple[Int[Array, ""], ...]:
     return tuple(jnp.asarray(m, jnp.int32) for m in mode)
 
 
-def _states(model: Model, t: Scalar, y: Y, mode: tuple) -> State:
+def states(model: Model, t: Scalar, y: Y, mode: tuple) -> State:
     """A mode with the component of h that is on its surface: the one nearest to zero."""
     parts = tuple(
         None
@@ -46,7 +46,7 @@ def _states(model: Model, t: Scalar, y: Y, mode: tuple) -> State:
     return State(mode, parts, tuple(jnp.zeros((), jnp.int32) for _ in mode))
 
 
-def _fired(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+def fired(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
     """The guard of switch k that is at zero: its surface, or while sliding the bound that λ has reached."""
     switch = model.switches[k]
     mode = state.mode[k]
@@ -61,6 +61,26 @@ def _fired(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
     lam = model.values(t, y, state)[k]
     left = lam if k in model.contacts else model.bound(k) - jnp.sign(lam) * lam
     return jnp.where(model.held(k, mode), left, surface)
+
+
+def landed(model: Model, k: int, t: Scalar, y: Y, state: State, after: tuple) -> tuple[Y, Scalar]:
+    """The state after an event of switch k at `t`, `y`, and how long the impacts that lead to rest take together."""
+    none = jnp.zeros_like(t)
+    if not isinstance(model.switches[k], impact):
+        return y, none
+    bounced, _ = rebound(model, k, t, y, state)
+    free = jnp.zeros_like(after[k])
+    flight = states(model, t, bounced, after[:k] + (free,) + after[k + 1 :])
+    end = completed(model, k, t, y, bounced, state, flight)
+    lands, rests = state.mode[k] == 0, after[k] == 1  # to lift off is no jump
+    rest = jnp.where(rests, end.rest, 0)
+    held = _held(model, t + rest, end.y, after)
+    out = jax.tree.map(lambda a, b, c: jnp.where(lands, jnp.where(rests, a, b), c), held, bounced, y)
+    return out, jnp.where(lands, rest, none)
+
+
+def _held(model: Model, t: Scalar, y: Y, mode: tuple) -> Y:
+    return model.project(t, y, states(model, t, y, mode))
 
 
 class _Jump(NamedTuple):
@@ -83,35 +103,21 @@ def _jump(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) ->
     def ravel(y: Y) -> Array:
         return jfu.ravel_pytree(y)[0]
 
-    state = _states(model, t, y, before)
-    h_t, n = jax.jacfwd(lambda t, x: _fired(model, k, t, unravel(x), state), argnums=(0, 1))(t, flat)
+    state = states(model, t, y, before)
+    h_t, n = jax.jacfwd(lambda t, x: fired(model, k, t, unravel(x), state), argnums=(0, 1))(t, flat)
     f_before = ravel(model.flow(t, y, state))
-    zero, eye = jnp.zeros_like(flat), jnp.eye(flat.size, dtype=flat.dtype)
-    stays = (zero, eye, jnp.zeros_like(t), zero, flat, eye)
-    r_t, dr, rest_t, drest, landed, onto = stays
+    onto = jnp.eye(flat.size, dtype=flat.dtype)
+
+    def hit(t: Scalar, x: Array) -> tuple[Array, Scalar]:
+        out, rest = landed(model, k, t, unravel(x), state, after)
+        return ravel(out), rest
+
+    (r_t, dr), (rest_t, drest) = jax.jacfwd(hit, argnums=(0, 1))(t, flat)
+    x, rest = hit(t, flat)
     if isinstance(model.switches[k], impact):
-        free = jnp.zeros_like(before[k])
-        rests = after[k] == 1
-
-        def held(t: Scalar, x: Array) -> Array:
-            return ravel(model.project(t, unravel(x), _states(model, t, unravel(x), after)))
-
-        def hit(t: Scalar, x: Array) -> tuple[Array, Scalar]:
-            y = unravel(x)
-            bounced, _ = rebound(model, k, t, y, state)
-            flight = _states(model, t, bounced, after[:k] + (free,) + after[k + 1 :])
-            end = completed(model, k, t, y, bounced, state, flight)
-            rest = jnp.where(rests, end.rest, 0)
-            return jnp.where(rests, held(t + rest, ravel(end.y)), ravel(bounced)), rest
-
-        (r_t, dr), (rest_t, drest) = jax.jacfwd(hit, argnums=(0, 1))(t, flat)
-        landed, rest = hit(t, flat)
-        onto = jnp.where(rests, jax.jacfwd(lambda x: held(t + rest, x))(landed), eye)
-        jumps = (r_t, dr, rest_t, drest, landed, onto)
-        # To lift off is no jump.
-        lands = before[k] == 0
-        r_t, dr, rest_t, drest, landed, onto = jax.tree.map(lambda a, b: jnp.where(lands, a, b), jumps, stays)
-    f_after = ravel(model.flow(t, unravel(landed), _states(model, t, unravel(landed), after)))
+        rests = (before[k] == 0) & (after[k] == 1)
+        onto = jnp.where(rests, jax.jacfwd(lambda x: ravel(_held(model, t + rest, unravel(x), after)))(x), onto)
+    f_after = ravel(model.flow(t, unravel(x), states(model, t, unravel(x), after)))
     return _Jump(n, h_t, f_before, f_after, dr, r_t, drest, rest_t, onto)
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from ._check import check_solve
 from ._filippov import Model, State
-from ._saltation import _states, saltation_matrices
+from ._saltation import saltation_matrices, states
 from ._solution import Solution
 from ._solve import solve
 from ._system import arrays_of, System
@@ -149,7 +149,7 @@ def _by_arcs(
 
     def arc(phi: Array, row: tuple) -> tuple[Array, Array]:
         a, b, y, mode, jump = row
-        smooth = _Arc(model, _states(model, a, y, tuple(mode)))
+        smooth = _Arc(model, states(model, a, y, tuple(mode)))
         # On an arc that runs backwards so do the times.
         low, high = jnp.minimum(a, b), jnp.maximum(a, b)
         inside = jnp.clip(times, low, high)

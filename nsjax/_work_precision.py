@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._check import check_system
-from ._orbit import find_orbit, Orbit
+from ._find_orbit import find_orbit
+from ._orbit import Orbit
 from ._regularise import banded, smoothed
 from ._solution import Solution
 from ._solve import solve

@@ -428,6 +428,22 @@ def stick_slip_orbit(**parameters: float) -> Orbit | None:
     return _orbit(period, y0, path.events, path.fundamental)
 
 
+def infinitely_unstable_orbit(c: float, v_dr: float) -> tuple[float, float, float]:
+    """Duration of the slip of the unstable orbit of section 6.7, x where it leaves the belt, and its period: backwards
+    from where it touches the belt's velocity, at k x + c v_dr = F_slip (m = k = F_slip = 1)."""
+    c, v = mp.mpf(c), mp.mpf(v_dr)
+    a, w = -c / 2, mp.sqrt(1 - c * c / 4)
+
+    def moves(t: Any) -> tuple[Any, Any]:
+        p, q = -c * v, (v + a * c * v) / w
+        e, cos, sin = mp.exp(a * t), mp.cos(w * t), mp.sin(w * t)
+        return 1 + e * (p * cos + q * sin), e * ((a * p + q * w) * cos + (a * q - p * w) * sin)
+
+    start = mp.findroot(lambda t: moves(t)[1] - v, (-6, -5), solver="anderson")
+    slides = (moves(start)[0] - (1 - c * v)) / v
+    return float(-start), float(moves(start)[0]), float(slides - start)
+
+
 def stick_slip_fold(c: float = 0.1, **parameters: float) -> tuple[float, float]:
     """(v_dr, x at the maximum) of the discontinuous fold of Fig. 6.15, where the slip arc that leaves stick returns to
     the belt's velocity tangentially, at k x + c v_dr = F_slip."""

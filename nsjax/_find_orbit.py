@@ -1,0 +1,138 @@
+"""The search for a periodic orbit."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.core
+import jax.lax as lax
+import jax.numpy as jnp
+
+from ._check import check_solve
+from ._cuts import cuts_from, cuts_near, Segment
+from ._guess import settle_down
+from ._orbit import Orbit
+from ._segments import by_segments
+from ._shooting import shoot
+from ._solution import raise_if, RESULTS
+from ._system import arrays_of, frozen, System
+from ._types import Scalar, Y
+
+
+def find_orbit(
+    system: System,
+    y0: Y,
+    *,
+    period: Any = None,
+    t0: Any = 0.0,
+    order: int = 1,
+    mode: Any = None,
+    method: Literal["shooting", "segments"] | None = None,
+    segments: Sequence[Segment] | None = None,
+    pieces: int = 1,
+    solver: dfx.AbstractSolver = dfx.Dopri8(),
+    stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    tol: float | None = None,
+    max_iterations: int = 30,
+    max_steps: int = 4096,
+    max_events: int = 64,
+    throw: bool = True,
+) -> Orbit:
+    """Finds a periodic orbit by optimistix's Newton method, in one of two formulations.
+
+    *Shooting*, y(t0 + period) = y0, goes through the event-driven flow, which finds the itinerary. With *segments* the
+    itinerary is given, by `segments` or by the solution from the guess, and the states and times at all events are
+    unknown; each segment is a smooth flow in its mode. That stays well-posed at a grazing and on surfaces that repel,
+    and finds unstable orbits from farther away; `Orbit.admissible` tells whether what it found is a solution.
+
+    For an autonomous system the period is unknown too and Poincaré's phase condition is added; the base point of the
+    result is moved away from events. Where Newton's method does not converge from the guess, the solution is first
+    followed to where it settles (this needs concrete values: not under `jit` or `vmap`). The orbit's period, states and
+    multipliers are differentiable with respect to the parameters of `system`, by implicit differentiation.
+
+    **Arguments:**
+
+    - `system`: the model. It is forced if its `period` is not None.
+    - `y0`: a guess of a state on the orbit, for a forced system at time `t0`.
+    - `period`: autonomous systems: a guess of the period [time]; found by following the solution if None. For forced
+        systems it is `order * system.period`, and must not be given.
+    - `t0`: time of the base point.
+    - `order`: subharmonic order of a forced orbit.
+    - `mode`: as for `solve`, for a guess on a surface.
+    - `method`: "shooting" or "segments"; by default segments if these are given, else shooting.
+    - `segments`: the itinerary and its durations, from `y0` on, as a list of `Segment`; the last ends where the first
+        begins, and so is in the same mode. `y0` lies on no surface.
+    - `pieces`: into how many pieces of equal length each segment is divided: multiple shooting, for orbits so unstable
+        that no single solution follows them.
+    - `solver`, `stepsize_controller`, `max_steps`, `max_events`: as for `solve`; by default Dopri8 with tolerances of
+        1e-12 (float32: 1e-6).
+    - `tol`: tolerance of Newton's method, by default 1e-10 (float32: 1e-4).
+    - `throw`: whether a failure raises; if not, look at `Orbit.result`.
+
+    **Returns:** an `Orbit`.
+
+    **Raises:** a runtime error that says whether the search ended in an equilibrium, in a multiple cover of a shorter
+    orbit, or nowhere.
+    """
+    if not isinstance(order, int) or order < 1:
+        raise ValueError(f"Argument `order` must be a positive integer, but got {order!r}.")
+    y0, t0, _, solver, controller, given = check_solve(
+        system, t0, t0, y0, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events, None
+    )
+    double = bool(jnp.finfo(t0.dtype).eps < 1e-10)
+    if stepsize_controller is None:
+        small = 1e-12 if double else 1e-6
+        controller = dfx.PIDController(rtol=small, atol=small)
+    tol = (1e-10 if double else 1e-4) if tol is None else tol
+    if method not in (None, "shooting", "segments"):
+        raise ValueError(f"Argument `method` must be 'shooting' or 'segments', but got {method!r}.")
+    if method == "shooting" and (segments is not None or pieces != 1):
+        raise ValueError("Arguments `segments` and `pieces` are for `method='segments'`, but it is 'shooting'.")
+    if not isinstance(pieces, int) or not 1 <= pieces <= 64:
+        raise ValueError(f"Argument `pieces` must be an integer from 1 to 64, but got {pieces!r}.")
+    system = arrays_of(system, t0.dtype)
+    how = dict(solver=solver, stepsize_controller=controller, max_steps=max_steps, max_events=max_events)
+    autonomous = system.period is None
+    if not autonomous and period is not None:
+        raise ValueError("Argument `period` must not be given for a forced system; use `order` for a subharmonic.")
+    if autonomous and order != 1:
+        raise ValueError("Argument `order` must be 1 for an autonomous system; pass the longer `period` instead.")
+    concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, y0, period)))
+    newton = dict(how=how, tol=tol, max_iterations=max_iterations)
+
+    def search(y0: Y, period: Scalar, mode: Any) -> Orbit:
+        if method != "segments" and pieces == 1:
+            return shoot(system, t0, y0, period, order=order, mode=mode, **newton)
+        cuts, closes = cuts_near(frozen(system), t0, lax.stop_gradient(y0), period, order, mode, how)
+        if concrete:  # without the rows that are only there to fill up
+            cuts = cuts.first(int(cuts.num) + 1)
+        orbit = by_segments(system, cuts, t0, order=order, pieces=pieces, **newton)
+        result = RESULTS.where(closes, orbit.result, RESULTS.orbit_not_found)
+        return eqx.tree_at(lambda o: o.result, orbit, result)
+
+    if segments is not None:
+        cuts = cuts_from(frozen(system), segments, t0, lax.stop_gradient(y0), how)
+        orbit = by_segments(system, cuts, t0, order=order, pieces=pieces, **newton)
+    elif autonomous and period is None:
+        start, period, rests = settle_down(frozen(system), t0, lax.stop_gradient(y0), given, how)
+        lost = ~(period > 0)
+        orbit = search(start, jnp.where(lost, 1, period), None)
+        end = RESULTS.where(rests, RESULTS.orbit_is_equilibrium, RESULTS.orbit_not_found)
+        orbit = eqx.tree_at(lambda o: o.result, orbit, RESULTS.where(lost, end, orbit.result))
+    else:
+        period = jnp.asarray(1.0 if period is None else period, t0.dtype)
+        if concrete and not period > 0:
+            raise ValueError(f"Argument `period` must be positive, but got {period}.")
+        orbit = search(y0, period, given)
+        if concrete and bool((orbit.result != RESULTS.successful) & (orbit.result != RESULTS.orbit_is_multiple_cover)):
+            y1, period, rests = settle_down(system, t0, y0, given, how)
+            if rests:
+                orbit = eqx.tree_at(lambda o: o.result, orbit, RESULTS.orbit_is_equilibrium)
+            if period > 0:
+                second = search(y1, period, None)
+                orbit = second if bool(second.result == RESULTS.successful) else orbit
+    if throw:
+        orbit = raise_if(orbit.result != RESULTS.successful, orbit.result, orbit)
+    return orbit

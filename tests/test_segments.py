@@ -1,0 +1,124 @@
+"""Periodic orbits in segments: against shooting, closed forms, and 40-digit references."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from models import Motion, pid
+
+from nsjax import find_orbit, gallery, RESULTS, Segment
+
+
+METHOD = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-13), max_steps=8192, max_events=16)
+REPELS = [Segment(-1, 3.0), Segment({"belt": 0}, 1.0, free=True), Segment([-1], 2.5)]
+
+
+def unstable(v_dr, segments=REPELS, y0=None, **change):
+    system = gallery.StickSlip(**({"c": 0.1, "v_dr": v_dr} | change))
+    return find_orbit(system, y0 or Motion(1.0, -1.15 * v_dr), segments=segments, **METHOD)
+
+
+def test_section_3_4():
+    orbit = find_orbit(gallery.StickSlip(), Motion(2.02, 0.0), period=13.54, method="segments", **METHOD)
+    exact = reference.stick_slip_orbit()
+    np.testing.assert_allclose(orbit.period, exact.period, atol=1e-11)
+    assert list(orbit.itinerary) == [{"belt": -1}, {"belt": 0}, {"belt": -1}]
+    stick, slip = orbit.events
+    np.testing.assert_allclose([stick.y_after.x, slip.y_after.x], [0, 2], atol=1e-11)
+    np.testing.assert_allclose(float(slip.t - stick.t), 10, atol=1e-11)
+    # The multiplier that vanishes because it sticks is no small number.
+    assert orbit.structural_zeros == 1 and orbit.multipliers[1] == 0
+    np.testing.assert_allclose(orbit.multipliers[0], 1, atol=1e-11)
+    assert orbit.stable and orbit.admissible and orbit.violation == 0 and orbit.result == RESULTS.successful
+
+
+@pytest.mark.parametrize("v_dr", [0.2, 0.5, 1.0])
+def test_infinitely_unstable(v_dr):
+    """Section 6.7, in forward time: it slides on the side of the belt's surface that repels, and leaves it freely."""
+    orbit = unstable(v_dr)
+    slip, x, period = reference.infinitely_unstable_orbit(0.1, v_dr)
+    np.testing.assert_allclose(orbit.period, period, atol=1e-11)
+    onto, off = orbit.events
+    np.testing.assert_allclose([onto.y_before.x, off.y_before.x], [1 - 0.1 * v_dr, x], atol=1e-11)
+    np.testing.assert_allclose(float(off.t - onto.t), period - slip, atol=1e-11)
+    assert onto.transversality < 1e-12  # tangentially
+    np.testing.assert_allclose(orbit.multipliers[1], 1, atol=1e-10)
+    assert np.isinf(orbit.multipliers[0]) and np.all(np.isinf(orbit.monodromy))
+    assert orbit.admissible and not orbit.stable
+    assert "multipliers  inf" in str(orbit)
+
+
+def test_derivative_of_an_unstable_orbit():
+    """Its period does not depend on v_dr, and x where it leaves the belt does so linearly: there is one scale."""
+
+    def of(v_dr, c):
+        orbit = unstable(v_dr, c=c)
+        return orbit.period, orbit.events.y_before.x[1]
+
+    jacobian = jax.jacfwd(lambda p: jnp.stack(of(*p)))(jnp.array([0.5, 0.1]))
+    (period_v, x_v), (period_c, x_c) = jacobian.T
+    lower, upper = (np.array(reference.infinitely_unstable_orbit(0.1 + d, 0.5)) for d in (-1e-6, 1e-6))
+    exact = (upper - lower) / 2e-6
+    _, x, _ = reference.infinitely_unstable_orbit(0.1, 0.5)
+    np.testing.assert_allclose([period_v, x_v], [0, (x - 1) / 0.5], atol=1e-9)
+    np.testing.assert_allclose([period_c, x_c], [exact[2], exact[1]], rtol=1e-8)
+
+
+def test_not_admissible():
+    """It slips through the belt's velocity and slides backwards in time: told, with where and how much."""
+    orbit = unstable(0.2, [Segment(-1, 4.0), Segment(0, 2.0, free=True), Segment(-1, 2.0)], Motion(0.3, 0.1))
+    assert not orbit.admissible and orbit.violation > 0.01
+    assert orbit.t0 <= orbit.violation_t <= orbit.t0 + orbit.period
+    assert "leaves its modes by 0.0739" in str(orbit)
+
+
+ENTRIES = [pytest.param(k, marks=() if k == "6.8" else pytest.mark.slow) for k in ("2.4", "3.5", "6.6", "6.8", "6.9")]
+
+
+@pytest.mark.parametrize("key", ENTRIES)
+def test_both_formulations_agree(key):
+    """States, events, multipliers; singular monodromy matrices included (pitfall 23)."""
+    entry = gallery.entry(key)
+    guess = dict(order=entry.orbit.order) if entry.orbit.period is None else dict(period=entry.orbit.period)
+    one, other = (
+        find_orbit(entry.system(), entry.orbit.y0, method=m, **guess, **METHOD) for m in ("shooting", "segments")
+    )
+    assert list(one.itinerary) == list(other.itinerary)
+    np.testing.assert_allclose(other.y0, one.y0, atol=1e-11)
+    np.testing.assert_allclose(other.period, one.period, atol=1e-11)
+    np.testing.assert_allclose(other.monodromy, one.monodromy, atol=1e-10)
+    np.testing.assert_allclose(other.multipliers, one.multipliers, atol=1e-10)
+    assert other.structural_zeros == one.structural_zeros == (1 if key in ("2.4", "6.8", "6.9") else 0)
+    for a, b in zip(one.events, other.events, strict=True):
+        np.testing.assert_allclose([b.t, *b.y_after], [a.t, *a.y_after], atol=1e-11)
+        np.testing.assert_allclose(b.transversality, a.transversality, atol=1e-10)
+    assert one.admissible and other.admissible and one.stable == other.stable
+
+
+@pytest.mark.parametrize(
+    "segments, message",
+    [
+        ([Segment(-1, 3.0), Segment(0, 1.0)], "must end in the mode in which it begins"),
+        ([Segment(-1, 3.0), Segment(-1, 1.0)], "must say by `ends=` which switch ends segment 0"),
+        ([Segment({"wall": 1}, 3.0)], "must name each of the switches"),
+        ([Segment([1, 1], 3.0)], "must have a value for each of the switches"),
+    ],
+)
+def test_wrong_segments(segments, message):
+    with pytest.raises(ValueError, match=message):
+        unstable(0.2, segments)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(method="collocation"), "must be 'shooting' or 'segments'"),
+        (dict(method="shooting", pieces=2), "are for `method='segments'`"),
+        (dict(pieces=0), "`pieces` must be an integer from 1 to 64"),
+    ],
+)
+def test_wrong_arguments(change, message):
+    with pytest.raises(ValueError, match=message):
+        find_orbit(gallery.StickSlip(), Motion(2.02, 0.0), period=13.54, **change)
