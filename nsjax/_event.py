@@ -122,7 +122,8 @@ def locate(
     value = jnp.take_along_axis(values, part[:, None], axis=-1)[:, 0]
     rate = jnp.take_along_axis(rates, part[:, None], axis=-1)[:, 0]
     shift = -value / jnp.where(rate == 0, 1, rate)
-    plain = (root - earliest) * length
+    # Where no root was found too the arithmetic must be of numbers: going backwards zero times that is not none.
+    plain = jnp.where(found, root - earliest, 0) * length
     trusted = (rate < 0) & (jnp.abs(shift) <= 1e-2 * length) & (plain <= 1e-4 * length)
     shift = jnp.where(trusted, shift, plain)
     # Of events at one instant the first in the order of declaration: as long as no guard has fallen below its rounding.

@@ -202,7 +202,9 @@ class TaylorStepper(Stepper):
             columns = self.guard_series(model, state, t, tree, ys, sigma) if model.slots else []
             curved = [c for row, affine in zip(columns, watch.affine) for c in row if not affine]
             if curved:
-                t_next = t + lax.stop_gradient(_resolvable(curved, t_next - t))
+                # A step that is not shortened ends where it was to end, whatever its beginning depends on.
+                share = lax.stop_gradient(_resolvable(curved, t_next - t))
+                t_next = jnp.where(share < 1, t + lax.stop_gradient(share * (t_next - t)), t_next)
         powers = _powers(t_next - t, self.degree)
         ks = _increments(ys, tree, powers)
         y1 = _sum(y, ks)
@@ -302,11 +304,11 @@ def _size(c: list[Scalar]) -> Scalar:
 
 
 def _resolvable(columns: list[list[Scalar]], dt: Scalar) -> Scalar:
-    """How much of `dt` polynomials of this degree can stand for these functions on."""
+    """On which share of `dt` polynomials of this degree can stand for these functions."""
     n = len(columns[0]) - 1
     fit = jnp.ones_like(dt)
     for c in columns:
         c = [x * power for x, power in zip(c, _powers(dt, n))]
         ratio = 0.5 * unresolved(dt.dtype) * _size(c) / _size(c[-3:])
         fit = jnp.minimum(fit, jnp.where(ratio < 1, ratio, 1) ** (1 / n))
-    return fit * dt
+    return fit

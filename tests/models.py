@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 import nsjax
-from nsjax import gallery
+from nsjax import gallery, solve
 
 
 Motion = type(gallery.THESIS["3.4"].y0)  # (x, v)
@@ -254,3 +254,18 @@ class Bumper(nsjax.System):
     @nsjax.sgn
     def clock(self, t, y):
         return t - self.t_c
+
+
+def with_change(entry, solver):
+    """The solution of an entry of the gallery, and how its end changes as start and state there do, all at once."""
+    control, end = pid(1e-12), min(entry.t1, 30.0)
+
+    def run(t0, y0):
+        sol = solve(
+            entry.system(), t0, end, y0, solver=solver, stepsize_controller=control, throw=False, max_steps=20_000
+        )
+        return sol.y1, sol
+
+    start = jnp.asarray(float(entry.t0)), jax.tree.map(jnp.asarray, entry.y0)
+    _, change, sol = jax.jvp(run, start, jax.tree.map(jnp.ones_like, start), has_aux=True)
+    return sol, change

@@ -38,6 +38,30 @@ def test_reverse_is_forward(forward, adjoint):
     np.testing.assert_allclose(backward, forward, rtol=1e-10, atol=1e-10)
 
 
+class Near(nsjax.System):
+    """x'' = -x below a surface that it all but reaches."""
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x + 0 * s.edge)
+
+    @nsjax.sgn
+    def edge(self, t, y):
+        return y.x - 1.0
+
+
+def test_surface_that_is_all_but_reached():
+    """Pitfall 18: a lane that looks for a root on its step and finds none has a gradient all the same."""
+
+    @jax.jit
+    @jax.vmap
+    @jax.grad
+    def slope(v):
+        return solve(Near(), 0.0, 4.0, Motion(0.0, v), adjoint=ADJOINTS["checkpoint"], **CHEAP).y1.x
+
+    lanes = 1 - jnp.geomspace(1e-9, 0.3, 40)
+    np.testing.assert_allclose(slope(lanes), np.sin(4.0), atol=1e-4)
+
+
 @pytest.mark.parametrize("adjoint", ["jacobian", pytest.param("checkpoint", marks=pytest.mark.slow)])
 def test_lanes(forward, adjoint):
     """Pitfall 18: under `vmap` the event's branch is run by lanes that have no event."""

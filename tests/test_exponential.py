@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import reference
 from jaxtyping import Array
-from models import flat, itinerary, Motion, Pair, Plane, times
+from models import flat, itinerary, Motion, Pair, Plane, times, with_change
 
 import nsjax
 from nsjax import Exponential, gallery, RESULTS, solve
@@ -216,15 +216,11 @@ def test_refusal_in_the_gallery(key):
 @pytest.mark.parametrize("key", [key for key in gallery.THESIS if key not in NOT_AFFINE])
 def test_gallery(key):
     """Every system of the thesis whose modes are affine, against Dopri8."""
-    entry = gallery.THESIS[key]
-    t1 = min(entry.t1, 30.0)
-    tight = dict(stepsize_controller=dfx.PIDController(rtol=1e-12, atol=1e-12), throw=False, max_steps=20_000)
-    want, got = (
-        solve(entry.system(), entry.t0, t1, entry.y0, solver=m, **tight) for m in (dfx.Dopri8(), Exponential())
-    )
+    (want, change), (got, changed) = (with_change(gallery.THESIS[key], m) for m in (dfx.Dopri8(), Exponential()))
     assert got.result == want.result and itinerary(got) == itinerary(want)
     np.testing.assert_allclose(times(got), times(want), atol=1e-10)
     np.testing.assert_allclose(flat(got.y1), flat(want.y1), atol=1e-10)
+    np.testing.assert_allclose(flat(changed), flat(change), atol=1e-8 * (1 + np.abs(flat(change)).max()))
 
 
 def test_float32():
