@@ -68,21 +68,33 @@ def model_of(system: System, t: Scalar, y: Y) -> Model:
     return Model(system, jnp.ones_like(t), t, y)
 
 
+def where(rows: Array, a: Any, b: Any) -> Any:
+    """Row by row."""
+    return jax.tree.map(lambda a, b: jnp.where(rows.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), a, b)
+
+
 def cuts_of(system: System, sol: Solution, t0: Scalar, y0: Y) -> Cuts:
-    """The segments of a solution."""
+    """The segments of a solution, up to where it was last in the mode in which it begins."""
     begin, end, y, modes = arcs(sol, t0, y0)
     model = model_of(system, t0, y0)
     events = sol.events
+    index = jnp.arange(len(begin), dtype=events.num.dtype)
+    closes = (index <= events.num) & jnp.all(modes == modes[0], axis=1)
+    num = jnp.max(jnp.where(closes, index, 0))
     last = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), events.y_before, sol.y1)
-    happened = jnp.arange(len(begin), dtype=events.num.dtype) < events.num
-    last = jax.tree.map(lambda a, b: jnp.where(happened.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), last, y)
+    last = where(index < events.num, last, jax.tree.map(lambda x: jnp.broadcast_to(x, (len(begin), *x.shape)), sol.y1))
+
+    def fill(rows: Any, value: Any) -> Any:
+        return where(index <= num, rows, jax.tree.map(lambda r, v: jnp.broadcast_to(v[num], r.shape), rows, value))
+
+    begin, end, y, modes, last = fill(begin, end), fill(end, end), fill(y, last), fill(modes, modes), fill(last, last)
 
     def state(t: Scalar, y: Y, mode: Array) -> State:
         return states(model, t, y, tuple(mode))
 
-    switch = jnp.concatenate([events.switch, jnp.full(1, -1, events.switch.dtype)])
+    switch = jnp.append(events.switch, jnp.asarray(-1, events.switch.dtype))
     within, ending = jax.vmap(state)(begin, y, modes), jax.vmap(state)(end, last, modes)
-    return Cuts(begin, end, y, within, ending, switch, events.num, (False,) * len(begin))
+    return Cuts(begin, end, y, within, ending, jnp.where(index < num, switch, -1), num, (False,) * len(begin))
 
 
 def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, how: dict) -> Cuts:
@@ -147,14 +159,15 @@ def _mode(names: list[str], mode: Any) -> tuple[int, ...]:
 def cuts_near(
     system: System, t0: Scalar, y0: Y, period: Scalar, order: int, mode: Any, how: dict
 ) -> tuple[Cuts, Bool[Array, ""]]:
-    """The segments of the solution from a guess, and whether it ends in the mode in which it begins."""
+    """The segments of the solution from a guess, and whether it came back to the mode in which it begins."""
     if system.period is None:
         y0, period = base_point(system, t0, y0, period, mode, how)
         mode = None
     else:
         period = jnp.asarray(system.period, t0.dtype) * order
     sol = solve(system, t0, t0 + period, y0, mode=mode, throw=False, **how)
-    return cuts_of(system, sol, t0, y0), is_okay(sol.result) & jnp.all(sol.mode0 == sol.mode1)
+    cuts = cuts_of(system, sol, t0, y0)
+    return cuts, is_okay(sol.result) & ((cuts.num > 0) | (sol.events.num == 0))
 
 
 def landing(model: Model, k: Array, t: Scalar, y: Y, ending: State, after: tuple) -> tuple[Y, Scalar]:

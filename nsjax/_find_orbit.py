@@ -1,6 +1,6 @@
 """The search for a periodic orbit."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import diffrax as dfx
@@ -21,6 +21,10 @@ from ._system import arrays_of, frozen, System
 from ._types import Scalar, Y
 
 
+def _inversion(y: Y) -> Y:
+    return jax.tree.map(jnp.negative, y)
+
+
 def find_orbit(
     system: System,
     y0: Y,
@@ -28,6 +32,7 @@ def find_orbit(
     period: Any = None,
     t0: Any = 0.0,
     order: int = 1,
+    symmetry: Callable[[Y], Y] | Literal["inversion"] | None = None,
     mode: Any = None,
     method: Literal["shooting", "segments"] | None = None,
     segments: Sequence[Segment] | None = None,
@@ -60,6 +65,8 @@ def find_orbit(
         systems it is `order * system.period`, and must not be given.
     - `t0`: time of the base point.
     - `order`: subharmonic order of a forced orbit.
+    - `symmetry`: for an orbit with y(t + period/2) = `symmetry`(y(t)), a function of the state, or "inversion" for
+        -y (6.24). Shooting takes half the period then, and finds no orbit that is less symmetric.
     - `mode`: as for `solve`, for a guess on a surface.
     - `method`: "shooting" or "segments"; by default segments if these are given, else shooting.
     - `segments`: the itinerary and its durations, from `y0` on, as a list of `Segment`; the last ends where the first
@@ -88,6 +95,12 @@ def find_orbit(
     tol = (1e-10 if double else 1e-4) if tol is None else tol
     if method not in (None, "shooting", "segments"):
         raise ValueError(f"Argument `method` must be 'shooting' or 'segments', but got {method!r}.")
+    if symmetry is not None and (method == "segments" or segments is not None or pieces != 1):
+        raise ValueError("Argument `symmetry` is for `method='shooting'`, but segments are asked for.")
+    if symmetry == "inversion":
+        symmetry = _inversion
+    if symmetry is not None and not callable(symmetry):
+        raise ValueError(f"Argument `symmetry` must be a function or 'inversion', but got {symmetry!r}.")
     if method == "shooting" and (segments is not None or pieces != 1):
         raise ValueError("Arguments `segments` and `pieces` are for `method='segments'`, but it is 'shooting'.")
     if not isinstance(pieces, int) or not 1 <= pieces <= 64:
@@ -104,7 +117,7 @@ def find_orbit(
 
     def search(y0: Y, period: Scalar, mode: Any) -> Orbit:
         if method != "segments" and pieces == 1:
-            return shoot(system, t0, y0, period, order=order, mode=mode, **newton)
+            return shoot(system, t0, y0, period, order=order, symmetry=symmetry, mode=mode, **newton)
         cuts, closes = cuts_near(frozen(system), t0, lax.stop_gradient(y0), period, order, mode, how)
         if concrete:  # without the rows that are only there to fill up
             cuts = cuts.first(int(cuts.num) + 1)

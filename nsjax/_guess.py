@@ -27,6 +27,7 @@ def base_point(system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any, met
     time after which the solution comes nearest to it again, among those within half the guess of it.
     """
     end_time = t0 + 2.5 * period
+    method = method | dict(max_events=3 * method["max_events"])  # which is meant for one period
     sol = solve(system, t0, end_time, y0, mode=mode, saveat=dfx.SaveAt(dense=True), throw=False, **method)
     begin, end, _, modes = arcs(sol, t0, y0)
     begin, end = jnp.minimum(begin, t0 + period), jnp.minimum(end, t0 + period)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from ._saltation import saltation_matrices
 from ._solution import Events, Itinerary, RESULTS, Solution
 from ._solve import solve
 from ._system import impact, relay, System
@@ -60,6 +61,11 @@ class Orbit(eqx.Module):
         """The modes the orbit passes through, beginning with that of its base point."""
         e = self.events
         return Itinerary(self.mode, e.switch, e.mode_after, e.num, e.names)
+
+    @property
+    def monodromy_jumps(self) -> Float[Array, "events n n"]:
+        """The saltation matrices by which the fundamental matrix jumps at `events`; not numbers past the last."""
+        return saltation_matrices(self.system, self.events)
 
     def solve(self, *, saveat: dfx.SaveAt = dfx.SaveAt(dense=True), periods: float = 1, **kwargs: Any) -> Solution:
         """The solution over one or several periods from the base point; further arguments as for `nsjax.solve`."""

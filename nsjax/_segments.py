@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from ._cuts import Cuts, landing, model_of, Smooth
+from ._cuts import Cuts, landing, model_of, Smooth, where
 from ._event import cosine
 from ._filippov import Model, State
 from ._jacobian import dense_jacobian
 from ._orbit import floquet, fractions, judge, Orbit, ravel, structural_zeros
 from ._saltation import fired, saltation_matrices
-from ._solution import Events, is_okay
+from ._solution import Events, is_okay, RESULTS
 from ._solve import solve
 from ._system import frozen, System
 from ._types import Scalar, Y
@@ -43,11 +43,6 @@ def _tangency(model: Model, k: Array, t: Scalar, y: Y, state: State) -> Scalar:
     for i in model.holdable:
         out = jnp.where(k == i, jnp.abs(values[i]) - 1, out)
     return out
-
-
-def _where(flag: Array, a: Any, b: Any) -> Any:
-    """Row by row."""
-    return jax.tree.map(lambda a, b: jnp.where(flag.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), a, b)
 
 
 class _Flows(eqx.Module):
@@ -205,7 +200,8 @@ def by_segments(
     events = _log(system, cuts, following, end, xs[:, -1], jumps(system, end, xs[:, -1]), unravel)
     monodromy, multipliers, stable, zeros = _floquet(system, cuts, events, happened, phi, autonomous)
     violation, violation_t = _violation(model_of(still, t0, y0), cuts, ts, xs, unravel)
-    in_order = jnp.all(end - begin >= -1e3 * tol * (1 + jnp.abs(period)))
+    admissible = (violation == 0) & jnp.all(end - begin >= -1e3 * tol * (1 + jnp.abs(period)))
+    result = RESULTS.where((result == RESULTS.successful) & ~admissible, RESULTS.orbit_not_admissible, result)
     return Orbit(
         system=system,
         t0=t0,
@@ -218,7 +214,7 @@ def by_segments(
         structural_zeros=zeros,
         stable=stable,
         residual=error,
-        admissible=(violation == 0) & in_order,
+        admissible=admissible,
         violation=violation,
         violation_t=violation_t,
         result=result,
@@ -254,7 +250,7 @@ def _log(
     empty = {k: jax.tree.map(jnp.zeros_like, v) for k, v in columns.items()}
     empty |= dict(t=jnp.full_like(end, jnp.inf), switch=jnp.full_like(cuts.switch, -1))
     names = tuple(k.name for k in system.switches)
-    return Events(**_where(happened, columns, empty), num=cuts.num, names=names)
+    return Events(**where(happened, columns, empty), num=cuts.num, names=names)
 
 
 def _floquet(
@@ -265,7 +261,7 @@ def _floquet(
     eye = jnp.eye(n, dtype=phi.dtype)
     zeros = structural_zeros(system, _modes(cuts.within.mode, happened))
     if not any(cuts.free):
-        jumps = _where(happened, saltation_matrices(system, events), jnp.broadcast_to(eye, phi.shape))
+        jumps = where(happened, saltation_matrices(system, events), jnp.broadcast_to(eye, phi.shape))
         monodromy = lax.scan(lambda m, row: (row[1] @ row[0] @ m, None), eye, (phi, jumps))[0]
         return monodromy, *floquet(monodromy, zeros, autonomous), zeros
     # Backwards in time a surface that repels attracts, and the multipliers are the reciprocals: what leaves the surface
@@ -280,7 +276,7 @@ def _floquet(
     tangent = jnp.roll(free, -1)
     ordinary = happened & ~free & ~tangent
     back = jnp.where(free[:, None, None], jumps, eye)
-    back = _where(ordinary, jnp.linalg.inv(_where(ordinary, jumps, jnp.broadcast_to(eye, phi.shape))), back)
+    back = where(ordinary, jnp.linalg.inv(where(ordinary, jumps, jnp.broadcast_to(eye, phi.shape))), back)
     backwards = lax.scan(lambda m, row: (m @ jnp.linalg.solve(row[0], row[1]), None), eye, (phi, back))[0]
     infinite = sum(cuts.free)
     multipliers, _ = floquet(backwards, jnp.asarray(infinite, jnp.int32), autonomous)

@@ -1,5 +1,6 @@
 """Periodic orbits by shooting: through the event-driven flow, which finds the itinerary."""
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
@@ -29,12 +30,13 @@ def shoot(
     y0: Y,
     period: Scalar,
     order: int,
+    symmetry: Callable[[Y], Y] | None,
     mode: Any,
     how: dict,
     tol: float,
     max_iterations: int,
 ) -> Orbit:
-    """Newton's method on y(t0 + period) = y0, and everything said of the orbit."""
+    """Newton's method on y(t0 + period) = y0, or y(t0 + period/2) = `symmetry`(y0), and what is said of the orbit."""
     autonomous = system.period is None
     still = frozen(system)
     model = Model(still, jnp.ones_like(t0), t0, y0)
@@ -52,6 +54,11 @@ def shoot(
         ok = is_okay(sol.result)
         return jnp.where(ok, ravel(sol.y1), jnp.nan)
 
+    part = 1.0 if symmetry is None else 0.5
+
+    def image(x: Array) -> Array:
+        return x if symmetry is None else ravel(symmetry(unravel(x)))
+
     if autonomous:
         # Poincaré's phase condition: the base point stays on the section through the guess.
         start = at_start(model, t0, guess)
@@ -61,7 +68,7 @@ def shoot(
         def residual(z: tuple, system: System) -> tuple:
             x, log_period = z
             phase = normal @ (x - flat) / jnp.where(speed == 0, 1, speed)
-            return flow(system, x, jnp.exp(log_period)) - x, phase
+            return flow(system, x, part * jnp.exp(log_period)) - image(x), phase
 
         unknown: Any = (flat, jnp.log(lax.stop_gradient(period)))
         at_rest = jnp.sqrt(speed) * period <= 1e-9 * (1 + jnp.max(jnp.abs(flat)))
@@ -69,7 +76,7 @@ def shoot(
 
         def residual(z: tuple, system: System) -> tuple:
             assert forcing is not None
-            return (flow(system, z[0], forcing) - z[0],)
+            return (flow(system, z[0], part * forcing) - image(z[0]),)
 
         unknown = (flat,)
         at_rest = jnp.zeros((), bool)

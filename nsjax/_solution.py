@@ -61,6 +61,10 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "No periodic orbit was found: Newton's method on the shooting equations did not converge. Start nearer to one "
         "(`y0`, `period`), or check that the system has one."
     )
+    orbit_not_admissible = (
+        "A periodic orbit was found in the segments given, but it is no solution: it does not keep to the modes of "
+        "these segments. With `throw=False` look at `violation` and `violation_t`; start nearer to one that does."
+    )
     orbit_is_equilibrium = (
         "The search for a periodic orbit ended in an equilibrium. Start farther away from it, near the orbit."
     )

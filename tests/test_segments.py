@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import reference
 from models import Motion, pid
+from test_contact import TableBall
 
 from nsjax import find_orbit, gallery, RESULTS, Segment
 
@@ -17,7 +18,7 @@ REPELS = [Segment(-1, 3.0), Segment({"belt": 0}, 1.0, free=True), Segment([-1], 
 
 def unstable(v_dr, segments=REPELS, y0=None, **change):
     system = gallery.StickSlip(**({"c": 0.1, "v_dr": v_dr} | change))
-    return find_orbit(system, y0 or Motion(1.0, -1.15 * v_dr), segments=segments, **METHOD)
+    return find_orbit(system, y0 or Motion(1.0, -1.15 * v_dr), segments=segments, throw=False, **METHOD)
 
 
 def test_section_3_4():
@@ -46,7 +47,7 @@ def test_infinitely_unstable(v_dr):
     assert onto.transversality < 1e-12  # tangentially
     np.testing.assert_allclose(orbit.multipliers[1], 1, atol=1e-10)
     assert np.isinf(orbit.multipliers[0]) and np.all(np.isinf(orbit.monodromy))
-    assert orbit.admissible and not orbit.stable
+    assert orbit.admissible and not orbit.stable and orbit.result == RESULTS.successful
     assert "multipliers  inf" in str(orbit)
 
 
@@ -69,7 +70,7 @@ def test_derivative_of_an_unstable_orbit():
 def test_not_admissible():
     """It slips through the belt's velocity and slides backwards in time: told, with where and how much."""
     orbit = unstable(0.2, [Segment(-1, 4.0), Segment(0, 2.0, free=True), Segment(-1, 2.0)], Motion(0.3, 0.1))
-    assert not orbit.admissible and orbit.violation > 0.01
+    assert not orbit.admissible and orbit.violation > 0.01 and orbit.result == RESULTS.orbit_not_admissible
     assert orbit.t0 <= orbit.violation_t <= orbit.t0 + orbit.period
     assert "leaves its modes by 0.0739" in str(orbit)
 
@@ -97,6 +98,71 @@ def test_both_formulations_agree(key):
     assert one.admissible and other.admissible and one.stable == other.stable
 
 
+class Ball(TableBall):
+    """Lands on a table, comes to rest in ever shorter bounces, and is thrown up again, once a period."""
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.w
+
+
+@pytest.mark.slow
+def test_rest():
+    """The orbit of a body that rests forgets all: it is that of the 40-digit reference after its first lift-off."""
+    method = METHOD | dict(max_events=32)
+    one, other = (
+        find_orbit(Ball(e=0.2), Motion(1.2, 0.0), t0=0.2, mode={"table": 0}, method=m, **method)
+        for m in ("shooting", "segments")
+    )
+    exact = reference.ball_on_table(e=0.2)
+    for orbit in one, other:
+        assert orbit.structural_zeros == 2 and np.all(orbit.multipliers == 0) and orbit.stable and orbit.admissible
+        impact, lift_off = orbit.events[0], orbit.events[-1]
+        np.testing.assert_allclose(lift_off.t, float(exact.lift_off), atol=1e-10)
+        np.testing.assert_allclose(impact.t + orbit.period, float(exact.next_impact), atol=1e-10)
+        np.testing.assert_allclose(impact.y_before.v, float(exact.next_velocity), atol=1e-10)
+
+
+def test_lanes():
+    """Under `vmap` rows are filled up, and each lane has its own result."""
+
+    @jax.jit
+    @jax.vmap
+    def run(v_dr):
+        system = gallery.StickSlip(v_dr=v_dr, c=0.1)
+        guess, options = Motion(2.0 - v_dr, 0.0), METHOD | dict(max_events=4)
+        orbit = find_orbit(system, guess, period=12.6, method="segments", throw=False, **options)
+        return orbit.period, orbit.multipliers, orbit.admissible, orbit.result
+
+    lanes = jnp.array([0.15, 0.2, 0.3, 1.5])
+    period, multipliers, admissible, result = run(lanes)
+    exact = [reference.stick_slip_orbit(c=0.1, v_dr=float(v)).period for v in lanes[:2]]
+    np.testing.assert_allclose(period[:2], exact, atol=1e-11)
+    np.testing.assert_allclose(multipliers[:2], [[1, 0]] * 2, atol=1e-11)
+    # One turn more than the guess has time for, which friction would have stopped; and an equilibrium, far from all.
+    names = [RESULTS.successful, RESULTS.successful, RESULTS.orbit_not_admissible, RESULTS.orbit_is_equilibrium]
+    assert all((result == name)[i] for i, name in enumerate(names))
+    assert list(admissible[:3]) == [True, True, False]
+
+
+@pytest.mark.slow
+def test_symmetric():
+    """Section 6.8 beside its stable asymmetric orbit: the unstable one of property (6.24), with two stick phases."""
+    system = gallery.thesis("6.8")
+    orbit = find_orbit(system, Motion(2.0, 1.0), symmetry="inversion", **METHOD)
+    half = orbit.solve(saveat=dfx.SaveAt(ts=orbit.period[None] / 2)).ys
+    np.testing.assert_allclose([*half.x, *half.v], [-orbit.y0.x, -orbit.y0.v], atol=1e-11)
+    assert [int(e.mode_after["friction"]) for e in orbit.events] == [0, -1, 0, 1]
+    assert not orbit.stable and abs(orbit.multipliers[0] - 1.50045) < 1e-5 and orbit.multipliers[1] == 0
+    again = find_orbit(system, orbit.y0, method="segments", **METHOD)
+    np.testing.assert_allclose(again.y0, orbit.y0, atol=1e-11)
+    np.testing.assert_allclose(again.multipliers, orbit.multipliers, atol=1e-10)
+    # Where the fundamental matrix jumps: onto the surface, and off it where friction falls from F_stick to F_slip.
+    jumps = orbit.monodromy_jumps[: len(orbit.events)]
+    np.testing.assert_allclose(jumps[0::2, 1, 1], 0, atol=1e-12)
+    np.testing.assert_allclose(jumps[1], jumps[3], atol=1e-11)
+
+
 @pytest.mark.parametrize(
     "segments, message",
     [
@@ -116,6 +182,8 @@ def test_wrong_segments(segments, message):
     [
         (dict(method="collocation"), "must be 'shooting' or 'segments'"),
         (dict(method="shooting", pieces=2), "are for `method='segments'`"),
+        (dict(symmetry="mirror"), "`symmetry` must be a function or 'inversion'"),
+        (dict(symmetry="inversion", method="segments"), "`symmetry` is for `method='shooting'`"),
         (dict(pieces=0), "`pieces` must be an integer from 1 to 64"),
     ],
 )

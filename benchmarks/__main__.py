@@ -1,0 +1,21 @@
+"""Every figure of benchmarks/README.md in one run, one after the other: about an hour.
+
+    python benchmarks
+"""
+
+import pathlib
+import subprocess
+import sys
+
+
+HERE = pathlib.Path(__file__).parent
+RUNS = (
+    ("sweep.py", "--workload", "S1", "S2", "S3", "--batch", "256", "--out", "sweep.json"),
+    ("cost.py", "--out", "cost.json"),
+    ("growth.py", "--out", "growth"),
+    ("work_precision.py", "--out", "work_precision"),
+)
+
+for script, *options in RUNS:
+    print(f"\n## {script}\n", flush=True)
+    subprocess.run([sys.executable, script, *options], cwd=HERE, check=True)
