@@ -168,6 +168,7 @@ def saltation_matrices(system: System, events: Events) -> Float[Array, "events n
 
     def one(t: Scalar, y: Y, switch: Array, before: Array, after: Array) -> Array:
         options = [_matrix(model, t, y, k, tuple(before), tuple(after)) for k in range(len(model.switches))]
-        return jnp.select([switch == k for k in range(len(options))], options, jnp.nan)
+        missing = jnp.full((len(jfu.ravel_pytree(y)[0]),) * 2, jnp.nan, dtype)
+        return jnp.select([switch == k for k in range(len(options))], options, jnp.nan) if options else missing
 
     return jax.vmap(one)(events.t, events.y_before, events.switch, events.mode_before, events.mode_after)
