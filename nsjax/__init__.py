@@ -3,7 +3,7 @@
 from . import gallery as gallery, plot as plot
 from ._cuts import Segment as Segment
 from ._exponential import Exponential as Exponential
-from ._find_orbit import find_orbit as find_orbit
+from ._find_orbit import find_orbit as find_orbit, find_orbits as find_orbits
 from ._orbit import Orbit as Orbit
 from ._regularise import banded as banded, smoothed as smoothed
 from ._saltation import (

@@ -1,4 +1,4 @@
-"""The search for a periodic orbit."""
+"""The search for a periodic orbit, and for all that many starts lead to."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
@@ -9,14 +9,16 @@ import jax
 import jax.core
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 
 from ._check import check_solve
 from ._cuts import cuts_from, cuts_near, Segment
 from ._guess import settle_down
-from ._orbit import Orbit
+from ._orbit import Orbit, ravel
 from ._segments import by_segments
 from ._shooting import shoot
 from ._solution import raise_if, RESULTS
+from ._sweep import sweep
 from ._system import arrays_of, frozen, System
 from ._types import Scalar, Y
 
@@ -149,3 +151,57 @@ def find_orbit(
     if throw:
         orbit = raise_if(orbit.result != RESULTS.successful, orbit.result, orbit)
     return orbit
+
+
+def find_orbits(system: System, starts: Y, *, period: Any = None, order: int = 1, **options: Any) -> list[Orbit]:
+    """The different periodic orbits that `find_orbit` finds from many starting points, unstable ones included.
+
+    **Arguments:**
+
+    - `system`: the model.
+    - `starts`: states to start from, leaves with a leading axis.
+    - `period`: autonomous systems: one guess of the period for all, or one each [time]; by default each start is
+        followed to where it settles, which finds what attracts and little else.
+    - `order`, `options`: as for `find_orbit`.
+
+    **Returns:** the orbits, those to which most starts led first; an empty list if there are none. Subharmonics that
+    differ by periods of the forcing only are one orbit.
+    """
+    for name in ("throw", "segments"):
+        if name in options:
+            raise ValueError(f"Argument `{name}` is not for `find_orbits`, but got {options[name]!r}.")
+    count = len(jax.tree.leaves(starts)[0])
+    guesses = None if period is None else jnp.broadcast_to(jnp.asarray(period), (count,))
+
+    def one(start: tuple[Y, Any]) -> Orbit:
+        return find_orbit(system, start[0], period=start[1], order=order, throw=False, **options)
+
+    batch = sweep(one, (starts, guesses))
+    arrays, static = eqx.partition(batch, eqx.is_array)
+    found: list[list[Any]] = []
+    for i in np.flatnonzero(np.asarray(batch.result == RESULTS.successful)):
+        orbit = eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static)
+        known = next((entry for entry in found if _same(entry[1], entry[2], orbit)), None)
+        if known is None:
+            found.append([1, orbit, _points(orbit, order)])
+        else:
+            known[0] += 1
+    return [orbit for _, orbit, _ in sorted(found, key=lambda entry: -entry[0])]
+
+
+def _points(orbit: Orbit, order: int) -> np.ndarray:
+    """States of which one is the base point of every orbit that is the same: those a period of the forcing apart, or
+    if there is none many along the way."""
+    number = order if orbit.system.period is not None else 512
+    ts = orbit.t0 + orbit.period * jnp.arange(number, dtype=orbit.t0.dtype) / number
+    return np.asarray(jax.vmap(ravel)(orbit.solve(saveat=dfx.SaveAt(ts=ts), throw=False).ys))
+
+
+def _same(known: Orbit, points: np.ndarray, orbit: Orbit) -> bool:
+    y = np.asarray(ravel(orbit.y0))
+    gap = np.linalg.norm(points - y, axis=1).min()
+    size = 1 + np.abs(points).max()
+    if orbit.system.period is not None:
+        return bool(gap <= 1e-6 * size)
+    step = np.linalg.norm(np.diff(points, axis=0), axis=1).max()
+    return bool(abs(known.period - orbit.period) <= 1e-6 * known.period and gap <= step)
