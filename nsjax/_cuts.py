@@ -101,6 +101,8 @@ def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, ho
     """The segments that a user wrote down, each followed in its mode for as long as was said."""
     names = [k.name for k in system.switches]
     modes = [_mode(names, s.mode) for s in segments]
+    if not segments:
+        raise ValueError("Argument `segments` must have at least one segment.")
     if modes[0] != modes[-1]:
         raise ValueError("Argument `segments` must end in the mode in which it begins: divide the segment in which the "
                          f"orbit closes in two; but the modes are {modes[0]} and {modes[-1]}.")  # fmt: skip
@@ -115,6 +117,10 @@ def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, ho
             )
         switch.append(names.index(ends))
     model = model_of(system, t0, y0)
+    for i, segment in enumerate(segments):
+        slides = i < len(switch) and switch[i] in model.holdable and switch[i] not in model.contacts
+        if segment.free and not (slides and modes[i][switch[i]] == 0):
+            raise ValueError(f"Argument `segments` has `free=True` in segment {i}, which must slide on what it leaves.")
     mode = jnp.asarray(modes, jnp.int32)
     switch = jnp.asarray([*switch, -1], jnp.int32)
     durations = jnp.asarray([s.duration for s in segments], t0.dtype)

@@ -81,15 +81,13 @@ class _Flows(eqx.Module):
 
         def along(a: Scalar, b: Scalar, x: Array, state: State) -> tuple[Array, Array, Array]:
             ts = jnp.linspace(a, b, SAMPLES)
-            # Times to save at increase.
-            forwards = jnp.where(b >= a, ts, ts[::-1])
 
             def path(x: Array) -> tuple[Array, Array]:
-                xs = self.piece(a, b, x, state, dfx.SaveAt(ts=forwards, t1=True))
+                xs = self.piece(a, b, x, state, dfx.SaveAt(ts=ts, t1=True))
                 return xs[-1], xs[:-1]
 
             (phi, _), (_, xs) = jax.jacfwd(path)(x), path(x)
-            return forwards, xs, phi
+            return ts, xs, phi
 
         ts, xs, phis = self.rows(along, begin, end, x)
         eye = jnp.eye(x.shape[-1], dtype=x.dtype)

@@ -169,6 +169,8 @@ def test_symmetric():
         ([Segment(-1, 3.0), Segment(-1, 1.0)], "must say by `ends=` which switch ends segment 0"),
         ([Segment({"wall": 1}, 3.0)], "must name each of the switches"),
         ([Segment([1, 1], 3.0)], "must have a value for each of the switches"),
+        ([], "at least one segment"),
+        ([Segment(-1, 3.0, free=True), Segment(0, 1.0), Segment(-1, 1.0)], "must slide on what it leaves"),
     ],
 )
 def test_wrong_segments(segments, message):
