@@ -1,6 +1,6 @@
 """Every figure of benchmarks/README.md in one run, one after the other: about an hour.
 
-    python benchmarks
+python benchmarks
 """
 
 import pathlib
