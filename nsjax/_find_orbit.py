@@ -51,8 +51,8 @@ def find_orbit(
 
     *Shooting*, y(t0 + period) = y0, goes through the event-driven flow, which finds the itinerary. With *segments* the
     itinerary is given, by `segments` or by the solution from the guess, and the states and times at all events are
-    unknown; each segment is a smooth flow in its mode. That stays well-posed at a grazing and on surfaces that repel,
-    and finds unstable orbits from farther away; `Orbit.admissible` tells whether what it found is a solution.
+    unknown; each segment is a smooth flow in its mode. That stays well-posed on surfaces that repel and, in `pieces`,
+    for violently unstable orbits; `Orbit.admissible` tells whether what it found is a solution.
 
     For an autonomous system the period is unknown too and Poincaré's phase condition is added; the base point of the
     result is moved away from events. Where Newton's method does not converge from the guess, the solution is first
@@ -70,7 +70,8 @@ def find_orbit(
     - `symmetry`: for an orbit with y(t + period/2) = `symmetry`(y(t)), a function of the state, or "inversion" for
         -y (6.24). Shooting takes half the period then, and finds no orbit that is less symmetric.
     - `mode`: as for `solve`, for a guess on a surface.
-    - `method`: "shooting" or "segments"; by default segments if these are given, else shooting.
+    - `method`: "shooting" or "segments"; by default segments if these or `pieces` are given,
+        else shooting.
     - `segments`: the itinerary and its durations, from `y0` on, as a list of `Segment`; the last ends where the first
         begins, and so is in the same mode. `y0` lies on no surface.
     - `pieces`: into how many pieces of equal length each segment is divided: multiple shooting, for orbits so unstable

@@ -1,7 +1,7 @@
 """Periodic orbits in segments: cut at their events, with the states and times of the cuts as unknowns.
 
-Each segment is a smooth flow in a mode that is given. So the equations stay well-posed where the flow is not: at a
-grazing, on a surface that repels, and for orbits that no solution follows for a whole period.
+Each segment is a smooth flow in a mode that is given. So the equations stay well-posed where the flow is not: on a
+surface that repels, and for orbits that no solution follows for a whole period.
 """
 
 from typing import Any

@@ -58,7 +58,7 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "the signs in the method decorated with `.reset` (or a coefficient of restitution below 0)."
     )
     orbit_not_found = (
-        "No periodic orbit was found: Newton's method on the shooting equations did not converge. Start nearer to one "
+        "No periodic orbit was found: Newton's method did not converge. Start nearer to one "
         "(`y0`, `period`), or check that the system has one."
     )
     orbit_not_admissible = (
