@@ -444,6 +444,37 @@ def infinitely_unstable_orbit(c: float, v_dr: float) -> tuple[float, float, floa
     return float(-start), float(moves(start)[0]), float(slides - start)
 
 
+def symmetric_friction_orbit(w: Any, guess: Sequence[float], c: Any = 0.01, f_0: Any = 2.5, stick: Any = 2) -> tuple:
+    """The symmetric orbit of section 6.8 with two stick phases (m = k = F_slip = 1): when it breaks away upwards and
+    where, when it sticks again (at minus that place), and the square of the derivative of that map of half a period."""
+    w, c, f_0, stick = (mp.mpf(p) for p in (w, c, f_0, stick))
+    a, wd = -c / 2, mp.sqrt(1 - c * c / 4)
+    response = f_0 / (1 - w * w + mp.mpc(0, 1) * c * w)
+
+    def slip(t_0: Any, x: Any, t: Any) -> tuple[Any, Any]:
+        def forced(t: Any) -> tuple[Any, Any]:
+            z = response * mp.exp(mp.mpc(0, 1) * w * t)
+            return z.real - 1, (mp.mpc(0, w) * z).real
+
+        p, q = x - forced(t_0)[0], -forced(t_0)[1]
+        q, tau = (q - a * p) / wd, t - t_0
+        e, cos, sin = mp.exp(a * tau), mp.cos(wd * tau), mp.sin(wd * tau)
+        moves = e * (p * cos + q * sin), e * ((a * p + q * wd) * cos + (a * q - p * wd) * sin)
+        return moves[0] + forced(t)[0], moves[1] + forced(t)[1]
+
+    def equations(t_0: Any, x: Any, t: Any) -> tuple:
+        end = slip(t_0, x, t)
+        return f_0 * mp.cos(w * t_0) - x - stick, end[1], end[0] + x
+
+    t_0, x, t = mp.findroot(equations, guess)
+
+    def halved(x: Any) -> Any:
+        start = mp.findroot(lambda s: f_0 * mp.cos(w * s) - x - stick, t_0)
+        return slip(start, x, mp.findroot(lambda s: slip(start, x, s)[1], t))[0]
+
+    return float(t_0), float(x), float(t), float(mp.diff(halved, x) ** 2)
+
+
 def stick_slip_fold(c: float = 0.1, **parameters: float) -> tuple[float, float]:
     """(v_dr, x at the maximum) of the discontinuous fold of Fig. 6.15, where the slip arc that leaves stick returns to
     the belt's velocity tangentially, at k x + c v_dr = F_slip."""

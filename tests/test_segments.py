@@ -152,7 +152,13 @@ def test_symmetric():
     half = orbit.solve(saveat=dfx.SaveAt(ts=orbit.period[None] / 2)).ys
     np.testing.assert_allclose([*half.x, *half.v], [-orbit.y0.x, -orbit.y0.v], atol=1e-11)
     assert [int(e.mode_after["friction"]) for e in orbit.events] == [0, -1, 0, 1]
-    assert not orbit.stable and abs(orbit.multipliers[0] - 1.50045) < 1e-5 and orbit.multipliers[1] == 0
+    down, up = orbit.events[1], orbit.events[3]  # breaks away
+    guess = [float(up.t), float(up.y_before.x), float(orbit.events[0].t + orbit.period)]
+    t_0, x, t, multiplier = reference.symmetric_friction_orbit(0.65, guess)
+    found = [up.t, up.y_before.x, orbit.events[0].t + orbit.period, -down.y_before.x]
+    np.testing.assert_allclose(found, [t_0, x, t, x], atol=1e-10)
+    np.testing.assert_allclose(orbit.multipliers, [multiplier, 0], atol=1e-9)
+    assert not orbit.stable
     again = find_orbit(system, orbit.y0, method="segments", **METHOD)
     np.testing.assert_allclose(again.y0, orbit.y0, atol=1e-11)
     np.testing.assert_allclose(again.multipliers, orbit.multipliers, atol=1e-10)
