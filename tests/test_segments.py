@@ -73,7 +73,7 @@ def test_not_admissible():
     orbit = unstable(0.2, [Segment(-1, 4.0), Segment(0, 2.0, free=True), Segment(-1, 2.0)], Motion(0.3, 0.1))
     assert not orbit.admissible and orbit.violation > 0.01 and orbit.result == RESULTS.orbit_not_admissible
     assert orbit.t0 <= orbit.violation_t <= orbit.t0 + orbit.period
-    assert "leaves its modes by 0.0739" in str(orbit)
+    assert f"leaves its modes by {float(orbit.violation):.3g}" in str(orbit)
 
 
 ENTRIES = [pytest.param(k, marks=() if k == "6.8" else pytest.mark.slow) for k in ("2.4", "3.5", "6.6", "6.8", "6.9")]
