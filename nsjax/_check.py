@@ -1,6 +1,6 @@
 """Mistakes in a model or in the arguments of `solve`, found before anything is integrated."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import diffrax as dfx
@@ -137,7 +137,8 @@ def _given(system: System, mode: Any) -> dict[str, Any]:
     if mode is None:
         return {}
     if not isinstance(mode, Mapping):
-        values = list(mode)
+        single = not isinstance(mode, Sequence) and jnp.ndim(mode) == 0
+        values = [mode] if single else list(mode)
         if len(values) != len(switches):
             raise ValueError(
                 f"Argument `mode` must have one value for each of the {len(switches)} switches "

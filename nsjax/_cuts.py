@@ -9,6 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ._arcs import model_of, Smooth
 from ._filippov import Model, State
 from ._guess import base_point
 from ._saltation import landed, states
@@ -52,20 +53,6 @@ class Cuts(NamedTuple):
     def first(self, rows: int) -> "Cuts":
         cut = jax.tree.map(lambda x: x[:rows], self._replace(num=(), free=()))
         return cut._replace(num=self.num, free=self.free[:rows])
-
-
-class Smooth(System):
-    """The field of one mode."""
-
-    model: Model
-    state: State
-
-    def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
-        return self.model.flow(t, y, self.state)
-
-
-def model_of(system: System, t: Scalar, y: Y) -> Model:
-    return Model(system, jnp.ones_like(t), t, y)
 
 
 def where(rows: Array, a: Any, b: Any) -> Any:
@@ -167,7 +154,7 @@ def cuts_near(
 ) -> tuple[Cuts, Bool[Array, ""]]:
     """The segments of the solution from a guess, and whether it came back to the mode in which it begins."""
     if system.period is None:
-        y0, period = base_point(system, t0, y0, period, mode, how)
+        y0, period = base_point(system, t0, y0, period, 1.0, mode, how)
         mode = None
     else:
         period = jnp.asarray(system.period, t0.dtype) * order

@@ -21,6 +21,9 @@ from ._system import AbstractSwitch, impact, relay, sgn, System
 from ._types import Mode, Scalar, Y
 
 
+BEYOND = 4  # added, with its sign, to the roots of a switch that is held with |λ| > 1 in backward time
+
+
 class Slot(NamedTuple):
     """One guard: a function that is positive while the mode lasts."""
 
@@ -32,7 +35,7 @@ class Slot(NamedTuple):
 class State(NamedTuple):
     """A mode, with the component of h that is active on the surface of each switch (None for a smooth surface) and
     the number of roots at the present instant, to be left out when the next one is sought; of a switch that is held the
-    sign of the bound that its value is at, or 0."""
+    sign of the bound that its value is at, or 0, and see `Model.edge`."""
 
     mode: Mode
     part: tuple[Int[Array, ""] | None, ...]
@@ -106,6 +109,23 @@ class Model(eqx.Module):
         switch = self.switches[k]
         assert isinstance(switch, sgn)
         return switch.bound(self.system)
+
+    def static(self, k: int) -> bool:
+        """Whether switch k has a static friction point, so that it holds beyond |λ| = 1."""
+        switch = self.switches[k]
+        return isinstance(switch, sgn) and switch.breakaway_fn is not None
+
+    def edge(self, k: int, value: Scalar, slack: float) -> Int[Array, ""]:
+        """The sign of the bound that the value of a held `sgn` switch is at, or 0.
+
+        Running backwards, what is held with |λ| > 1 by static friction is let go where |λ| falls to 1, as there the
+        field beside the surface turns round (section 6.7). Which side of 1 it came from is remembered by `BEYOND`.
+        """
+        sign = jnp.sign(value).astype(jnp.int32)
+        edge = jnp.where(jnp.abs(value) >= (1 - slack) * self.bound(k), sign, 0)
+        if self.static(k):
+            edge = edge + jnp.where((self.direction < 0) & (jnp.abs(value) > 1 + slack), BEYOND * sign, 0)
+        return edge
 
     def held(self, k: int, mode: Any) -> Bool[Array, ""]:
         """Whether `mode` of switch k holds the solution on its surface."""
@@ -259,6 +279,8 @@ class Model(eqx.Module):
             k, switch, mode = slot.switch, self.switches[slot.switch], state.mode[slot.switch]
             if slot.holding:
                 left = s[k] if k in self.contacts else self.bound(k) - slot.part * s[k]
+                if self.static(k):
+                    left = jnp.where(state.roots[k] * slot.part <= -BEYOND, -slot.part * s[k] - 1, left)
                 row = [jnp.where(self.held(k, mode), left, one)]
             elif isinstance(switch, relay):
                 on = switch.guard(self.system, t * self.direction, y)
@@ -299,7 +321,8 @@ class Model(eqx.Module):
             if k in self.holdable:
                 held = self.held(k, mode)
                 if holding:
-                    rows.append([jnp.where(held & (roots == j), 1, none)])
+                    at = (roots == j) | (roots == j * (BEYOND + 1)) if self.static(k) else roots == j
+                    rows.append([jnp.where(held & at, 1, none)])
                     continue
                 roots = jnp.where(held, none, roots)
             if part is None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ._check import check_solve
 from ._cuts import cuts_from, cuts_near, Segment
-from ._guess import settle_down
+from ._guess import repeats, settle_down
 from ._orbit import Orbit, ravel
 from ._segments import by_segments
 from ._shooting import shoot
@@ -33,8 +33,9 @@ def find_orbit(
     *,
     period: Any = None,
     t0: Any = 0.0,
-    order: int = 1,
+    order: int | None = 1,
     symmetry: Callable[[Y], Y] | Literal["inversion"] | None = None,
+    backward: bool = False,
     mode: Any = None,
     method: Literal["shooting", "segments"] | None = None,
     segments: Sequence[Segment] | None = None,
@@ -55,9 +56,12 @@ def find_orbit(
     for violently unstable orbits; `Orbit.admissible` tells whether what it found is a solution.
 
     For an autonomous system the period is unknown too and Poincaré's phase condition is added; the base point of the
-    result is moved away from events. Where Newton's method does not converge from the guess, the solution is first
-    followed to where it settles (this needs concrete values: not under `jit` or `vmap`). The orbit's period, states and
-    multipliers are differentiable with respect to the parameters of `system`, by implicit differentiation.
+    result is moved away from events. The orbit's period, states and multipliers are differentiable with respect to the
+    parameters of `system`, twice too, by implicit differentiation.
+
+    Where shooting does not converge from the guess, segments are tried, then segments in eight pieces, and then from
+    where the solution settles: unless `method` says which it is to be. (This needs concrete values: under `jit` or
+    `vmap` there is one try.)
 
     **Arguments:**
 
@@ -66,12 +70,15 @@ def find_orbit(
     - `period`: autonomous systems: a guess of the period [time]; found by following the solution if None. For forced
         systems it is `order * system.period`, and must not be given.
     - `t0`: time of the base point.
-    - `order`: subharmonic order of a forced orbit.
+    - `order`: subharmonic order of a forced orbit; if None, the solution is followed to where it settles, and after
+        how many periods of the forcing (up to 16) it repeats itself there is found out.
     - `symmetry`: for an orbit with y(t + period/2) = `symmetry`(y(t)), a function of the state, or "inversion" for
         -y (6.24). Shooting takes half the period then, and finds no orbit that is less symmetric.
+    - `backward`: whether to shoot in backward time: for an orbit that leaves a surface which repels (section 6.7), or
+        whose multipliers all lie outside the unit circle. What is returned is the orbit as it runs forwards.
     - `mode`: as for `solve`, for a guess on a surface.
-    - `method`: "shooting" or "segments"; by default segments if these or `pieces` are given,
-        else shooting.
+    - `method`: "shooting" or "segments"; by default segments if these or `pieces` are given, else shooting, and see
+        above.
     - `segments`: the itinerary and its durations, from `y0` on, as a list of `Segment`; the last ends where the first
         begins, and so is in the same mode. `y0` lies on no surface.
     - `pieces`: into how many pieces of equal length each segment is divided: multiple shooting, for orbits so unstable
@@ -86,8 +93,8 @@ def find_orbit(
     **Raises:** a runtime error that says whether the search ended in an equilibrium, in a multiple cover of a shorter
     orbit, or nowhere.
     """
-    if not isinstance(order, int) or order < 1:
-        raise ValueError(f"Argument `order` must be a positive integer, but got {order!r}.")
+    if order is not None and (not isinstance(order, int) or order < 1):
+        raise ValueError(f"Argument `order` must be a positive integer or None, but got {order!r}.")
     y0, t0, _, solver, controller, given = check_solve(
         system, t0, t0, y0, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events, None
     )
@@ -104,6 +111,8 @@ def find_orbit(
         symmetry = _inversion
     if symmetry is not None and not callable(symmetry):
         raise ValueError(f"Argument `symmetry` must be a function or 'inversion', but got {symmetry!r}.")
+    if backward and (method == "segments" or segments is not None or pieces != 1):
+        raise ValueError("Argument `backward` is for `method='shooting'`, but segments are asked for.")
     if method == "shooting" and (segments is not None or pieces != 1):
         raise ValueError("Arguments `segments` and `pieces` are for `method='segments'`, but it is 'shooting'.")
     if not isinstance(pieces, int) or not 1 <= pieces <= 64:
@@ -113,41 +122,59 @@ def find_orbit(
     autonomous = system.period is None
     if not autonomous and period is not None:
         raise ValueError("Argument `period` must not be given for a forced system; use `order` for a subharmonic.")
-    if autonomous and order != 1:
+    if autonomous and order not in (1, None):
         raise ValueError("Argument `order` must be 1 for an autonomous system; pass the longer `period` instead.")
     concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, y0, period)))
+    if order is None and not autonomous and not concrete:
+        raise ValueError("Argument `order` must be given under `jit` and `vmap`: finding it out needs concrete values.")
     newton = dict(how=how, tol=tol, max_iterations=max_iterations)
+    sign = -1.0 if backward else 1.0
 
-    def search(y0: Y, period: Scalar, mode: Any) -> Orbit:
-        if method != "segments" and pieces == 1:
-            return shoot(system, t0, y0, period, order=order, symmetry=symmetry, mode=mode, **newton)
+    def search(y0: Y, period: Scalar, order: int, mode: Any, pieces: int | None) -> Orbit:
+        """By shooting, or by segments in so many pieces."""
+        if pieces is None:
+            return shoot(system, t0, y0, period, order, symmetry, backward, mode, **newton)
         cuts, closes = cuts_near(frozen(system), t0, lax.stop_gradient(y0), period, order, mode, how)
         if concrete:  # without the rows that are only there to fill up
             cuts = cuts.first(int(cuts.num) + 1)
-        orbit = by_segments(system, cuts, t0, order=order, pieces=pieces, **newton)
+        orbit = by_segments(system, cuts, t0, order, pieces, **newton)
         result = RESULTS.where(closes, orbit.result, RESULTS.orbit_not_found)
         return eqx.tree_at(lambda o: o.result, orbit, result)
 
+    def tries(y0: Y, period: Scalar, order: int, mode: Any) -> Orbit:
+        """In the ways that may be tried, until one finds it."""
+        shoots = method != "segments" and pieces == 1
+        orbit = search(y0, period, order, mode, None if shoots else pieces)
+        if concrete and shoots and method is None and symmetry is None and not backward:
+            for more in (1, 8):
+                if orbit.result == RESULTS.orbit_not_found:
+                    other = search(y0, period, order, mode, more)
+                    orbit = other if other.result == RESULTS.successful else orbit
+        return orbit
+
     if segments is not None:
         cuts = cuts_from(frozen(system), segments, t0, lax.stop_gradient(y0), how)
-        orbit = by_segments(system, cuts, t0, order=order, pieces=pieces, **newton)
+        orbit = by_segments(system, cuts, t0, order or 1, pieces, **newton)
     elif autonomous and period is None:
-        start, period, rests = settle_down(frozen(system), t0, lax.stop_gradient(y0), given, how)
+        start, period, rests = settle_down(frozen(system), t0, lax.stop_gradient(y0), sign, given, how)
         lost = ~(period > 0)
-        orbit = search(start, jnp.where(lost, 1, period), None)
+        orbit = tries(start, jnp.where(lost, 1, period), 1, None)
         end = RESULTS.where(rests, RESULTS.orbit_is_equilibrium, RESULTS.orbit_not_found)
         orbit = eqx.tree_at(lambda o: o.result, orbit, RESULTS.where(lost, end, orbit.result))
+    elif order is None:
+        start, _, _ = settle_down(system, t0, y0, sign, given, how)
+        orbit = tries(start, jnp.ones_like(t0), int(repeats(system, t0, start, sign, how)), None)
     else:
         period = jnp.asarray(1.0 if period is None else period, t0.dtype)
         if concrete and not period > 0:
             raise ValueError(f"Argument `period` must be positive, but got {period}.")
-        orbit = search(y0, period, given)
+        orbit = tries(y0, period, order, given)
         if concrete and bool((orbit.result != RESULTS.successful) & (orbit.result != RESULTS.orbit_is_multiple_cover)):
-            y1, period, rests = settle_down(system, t0, y0, given, how)
+            y1, period, rests = settle_down(system, t0, y0, sign, given, how)
             if rests:
                 orbit = eqx.tree_at(lambda o: o.result, orbit, RESULTS.orbit_is_equilibrium)
             if period > 0:
-                second = search(y1, period, None)
+                second = tries(y1, period, order, None)
                 orbit = second if bool(second.result == RESULTS.successful) else orbit
     if throw:
         orbit = raise_if(orbit.result != RESULTS.successful, orbit.result, orbit)

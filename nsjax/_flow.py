@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 
 from ._compact import compact_cond
 from ._event import land, Landing
-from ._filippov import Model, State
+from ._filippov import BEYOND, Model, State
 from ._once import once
 from ._save import Log, Saved
 from ._solution import RESULTS
@@ -173,9 +173,11 @@ class Flow(eqx.Module):
         # A lane that looked for a root may have found none.
         event = attempt.busy & there.found
         there = jax.tree.map(lambda a, b: jnp.where(event, a, b), there, end)
-        return there._replace(
-            state=there.state._replace(roots=tuple(jnp.where(event, r, 0) for r in there.state.roots))
-        )
+        roots = list(there.state.roots)
+        for k, r in enumerate(roots):
+            later = jnp.where(jnp.abs(r) >= BEYOND, jnp.sign(r) * BEYOND, 0) if model.static(k) else 0
+            roots[k] = jnp.where(event, r, later)
+        return there._replace(state=there.state._replace(roots=tuple(roots)))
 
     def body(self, c: Carry) -> Carry:
         model = self.model

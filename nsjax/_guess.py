@@ -5,9 +5,10 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from ._filippov import Model
 from ._orbit import distance, ravel
@@ -19,26 +20,28 @@ from ._types import Scalar, Y
 from ._variational import arcs
 
 
-def base_point(system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any, method: dict) -> tuple[Y, Scalar]:
-    """A better guess, from the solution over two and a half guessed periods.
+def base_point(
+    system: System, t0: Scalar, y0: Y, period: Scalar, sign: float, mode: Any, method: dict
+) -> tuple[Y, Scalar]:
+    """A better guess, from the solution over two and a half guessed periods (backwards if `sign` is -1).
 
     The base point is in the middle of the longest arc between events, on a smooth one if there is any: the flow map is
     only one-sided differentiable at an event, and the phase condition wants a transversal section. The period is the
     time after which the solution comes nearest to it again, among those within half the guess of it.
     """
-    end_time = t0 + 2.5 * period
+    end_time = t0 + sign * 2.5 * period
     method = method | dict(max_events=3 * method["max_events"])  # which is meant for one period
     sol = solve(system, t0, end_time, y0, mode=mode, saveat=dfx.SaveAt(dense=True), throw=False, **method)
     begin, end, _, modes = arcs(sol, t0, y0)
-    begin, end = jnp.minimum(begin, t0 + period), jnp.minimum(end, t0 + period)
+    begin, end = (jnp.minimum(sign * (t - t0), period) for t in (begin, end))
     slides = jnp.stack(
         [modes[:, k] == 0 for k, s in enumerate(system.switches) if isinstance(s, sgn)] or [jnp.zeros(len(begin), bool)]
     ).any(0)
     longest = jnp.argmax((end - begin) * jnp.where(slides, 1e-6, 1.0))
-    base = 0.5 * (begin[longest] + end[longest])
+    base = t0 + sign * 0.5 * (begin[longest] + end[longest])
     here = sol.evaluate(base)
     share = jnp.linspace(0.5, 1.5, 401, dtype=base.dtype)
-    later = jax.vmap(lambda u: ravel(sol.evaluate(base + u * period)))(share)
+    later = jax.vmap(lambda u: ravel(sol.evaluate(base + sign * u * period)))(share)
     extent = jnp.max(later, axis=0) - jnp.min(later, axis=0)
     gap = distance(later / jnp.where(extent == 0, 1, extent), ravel(here) / jnp.where(extent == 0, 1, extent))
     # Of equally near returns the one nearest to the guess: a user who asks for two laps gets two.
@@ -63,26 +66,29 @@ def at_start(model: Model, t: Scalar, y: Y) -> Any:
 
 
 @eqx.filter_jit
-def settle_down(system: System, t0: Scalar, y0: Y, mode: Any, method: dict) -> tuple[Y, Scalar, Bool[Array, ""]]:
-    """Follows the solution to where it settles; for an autonomous system also the time in which it returns there (0 if
-    it does not), and whether it comes to rest.
+def settle_down(
+    system: System, t0: Scalar, y0: Y, sign: float, mode: Any, method: dict
+) -> tuple[Y, Scalar, Bool[Array, ""]]:
+    """Follows the solution (backwards if `sign` is -1) to where it settles; for an autonomous system also the time in
+    which it returns there (0 if it does not), and whether it comes to rest.
 
     How long that takes is measured in steps of the integration, which know the system's own scale of time.
     """
     if system.period is not None:
-        end = t0 + 100 * jnp.asarray(system.period, t0.dtype)
-        return solve(system, t0, end, y0, mode=mode, throw=False, **method).y1, end - t0, jnp.zeros((), bool)
+        length = 100 * jnp.asarray(system.period, t0.dtype)
+        last = solve(system, t0, t0 + sign * length, y0, mode=mode, throw=False, **method)
+        return last.y1, length, jnp.zeros((), bool)
     # Only a guess is wanted: a loose tolerance makes long steps, and so the solution is followed farther.
     loose = 1e-6 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4
     controller = dfx.PIDController(rtol=loose, atol=loose)
     big = dict(solver=method["solver"], stepsize_controller=controller, max_steps=2000, max_events=1000)
-    last = solve(system, t0, t0 + 1e9, y0, mode=mode, throw=False, **big)
+    last = solve(system, t0, t0 + sign * 1e9, y0, mode=mode, throw=False, **big)
     given = tuple(last.mode1) if system.switches else None
-    loop = solve(system, t0, t0 + 1e9, last.y1, mode=given, saveat=dfx.SaveAt(dense=True), throw=False, **big)
+    loop = solve(system, t0, t0 + sign * 1e9, last.y1, mode=given, saveat=dfx.SaveAt(dense=True), throw=False, **big)
     starts, stops, points, _, steps = loop.dense
     # Eight points a step: the polynomial between control points bends little.
     u = jnp.asarray(np.arange(8) / 8, starts.dtype)
-    times = (starts[:, None] + (stops - starts)[:, None] * u).ravel()
+    times = sign * (starts[:, None] + (stops - starts)[:, None] * u).ravel()
     valid = jnp.repeat(jnp.arange(len(starts), dtype=steps.dtype) < steps, 8)
     states = jax.vmap(lambda t: ravel(loop.evaluate(t)))(jnp.where(valid, times, t0))
     here = ravel(last.y1)
@@ -94,4 +100,20 @@ def settle_down(system: System, t0: Scalar, y0: Y, mode: Any, method: dict) -> t
     near = far & (gap < 0.1)
     low = near & (gap <= jnp.roll(gap, 1)) & (gap <= jnp.roll(gap, -1))
     rests = (last.result == RESULTS.max_steps_reached) & (jnp.max(scale) <= 1e-4 * (1 + jnp.max(jnp.abs(here))))
-    return last.y1, jnp.where(rests, 0, times[jnp.argmax(low)] - t0), rests
+    return last.y1, jnp.where(rests, 0, sign * (times[jnp.argmax(low)] - t0)), rests
+
+
+@eqx.filter_jit
+def repeats(system: System, t0: Scalar, y0: Y, sign: float, method: dict, most: int = 16) -> Int[Array, ""]:
+    """After how many periods of the forcing a solution that has settled repeats itself."""
+    period = jnp.asarray(system.period, t0.dtype)
+
+    def lap(y: Y, _: Any) -> tuple[Y, Array]:
+        y = solve(system, t0, t0 + sign * period, y, throw=False, **method).y1
+        return y, ravel(y)
+
+    _, points = lax.scan(lap, y0, None, length=most)
+    gaps = distance(points, ravel(y0))
+    # What is left of the way to where it settles is small beside how far the points lie apart, or all there is.
+    extent = 1e-9 * (1 + jnp.max(jnp.abs(points))) + 1e-2 * jnp.max(gaps)
+    return 1 + jnp.argmax(gaps <= jnp.maximum(extent, 2 * jnp.min(gaps)))

@@ -5,15 +5,16 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 import jax.flatten_util as jfu
-import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from ._saltation import saltation_matrices
+from ._arcs import Arcs, model_of, Path, path_of, SAMPLES
+from ._floquet import trivial
+from ._saltation import saltation_matrices, states
 from ._solution import Events, Itinerary, RESULTS, Solution
 from ._solve import solve
-from ._system import impact, relay, System
+from ._system import System
 from ._types import Scalar, Y
 
 
@@ -35,6 +36,7 @@ class Orbit(eqx.Module):
     - `admissible`: whether the orbit keeps to its modes: stays on its sides of the surfaces, with |λ| within its bound
         while it slides and a pushing force while it rests. One found by shooting does.
     - `violation`, `violation_t`: how far it does not, in the unit of h, λ or of the force, and when.
+    - `arcs`: times, states and modes of the smooth arcs between the events.
     - `result`: `RESULTS`.
     """
 
@@ -52,6 +54,7 @@ class Orbit(eqx.Module):
     admissible: Bool[Array, ""]
     violation: Scalar
     violation_t: Scalar
+    arcs: Arcs
     result: RESULTS
     # solver, stepsize_controller, max_steps, max_events: static, so that orbits come out of `vmap`
     options: tuple[tuple[str, Any], ...] = eqx.field(static=True)
@@ -67,8 +70,53 @@ class Orbit(eqx.Module):
         """The saltation matrices by which the fundamental matrix jumps at `events`; not numbers past the last."""
         return saltation_matrices(self.system, self.events)
 
+    @property
+    def trivial(self) -> Bool[Array, "*batch n"]:
+        """Which multiplier is that of a shift along the orbit: of an autonomous system the one nearest to 1."""
+        if self.system.period is not None:
+            return jnp.zeros(self.multipliers.shape, bool)
+        return trivial(self.multipliers)
+
+    def poincare_derivative(self, normal: Y | None = None) -> Float[Array, "n n"]:
+        """The derivative of the Poincaré map at the base point, (I - f nᵀ / (nᵀ f)) Φ, (6.7).
+
+        Its eigenvalues are the multipliers, with 0 in place of the trivial one.
+
+        **Arguments:**
+
+        - `normal`: n, the normal of the section, a state; by default that of the section perpendicular to the flow.
+
+        **Returns:** the matrix, for the state flattened by `ravel_pytree`. For a forced system, whose section is a
+        phase of the forcing, it is the monodromy matrix.
+
+        **Raises:** `ValueError` for a forced system with a `normal`.
+        """
+        if self.system.period is not None:
+            if normal is not None:
+                raise ValueError("Argument `normal` must be None for a forced system: its section is a phase of it.")
+            return self.monodromy
+        model = model_of(self.system, self.t0, self.y0)
+        f = ravel(model.flow(self.t0, self.y0, states(model, self.t0, self.y0, tuple(self.mode))))
+        n = f if normal is None else ravel(normal).astype(f.dtype)
+        return self.monodromy - jnp.outer(f, n @ self.monodromy) / (n @ f)
+
+    def path(self, samples: int = SAMPLES) -> Path:
+        """States along its arcs, each followed in its own mode: also where the flow would leave an orbit that is
+        infinitely or violently unstable.
+
+        **Arguments:**
+
+        - `samples`: how many in each arc (or in each of its pieces), both ends included.
+
+        **Returns:** a `Path` with `t`, `y` and `mode`, one row for each arc; those past the last have no length.
+        """
+        return path_of(self.system, self.arcs, samples, self.options)
+
     def solve(self, *, saveat: dfx.SaveAt = dfx.SaveAt(dense=True), periods: float = 1, **kwargs: Any) -> Solution:
-        """The solution over one or several periods from the base point; further arguments as for `nsjax.solve`."""
+        """The solution over one or several periods from the base point; further arguments as for `nsjax.solve`.
+
+        It leaves an orbit that is infinitely unstable at the surface that repels: see `path`.
+        """
         end = self.t0 + periods * self.period
         mode = tuple(self.mode) if self.events.names else None
         return solve(self.system, self.t0, end, self.y0, mode=mode, saveat=saveat, **(dict(self.options) | kwargs))
@@ -95,35 +143,6 @@ def ravel(y: Y) -> Array:
 
 def distance(a: Array, b: Array) -> Array:
     return jnp.max(jnp.abs(a - b), axis=-1)
-
-
-def structural_zeros(system: System, modes: Int[Array, "arcs switches"]) -> Int[Array, ""]:
-    """How many multipliers vanish because the solution is held on surfaces: each that slides takes one dimension of the
-    perturbations, each contact that rests two, and what is lost on one arc of the orbit is lost for all."""
-    lost = jnp.zeros(len(modes), jnp.int32)
-    for k, switch in enumerate(system.switches):
-        if not isinstance(switch, relay):
-            held = (
-                jnp.where(modes[:, k] == 1, 2, 0) if isinstance(switch, impact) else jnp.where(modes[:, k] == 0, 1, 0)
-            )
-            lost += held.astype(lost.dtype)
-    return jnp.max(lost)
-
-
-def floquet(
-    monodromy: Float[Array, "n n"], zeros: Int[Array, ""], autonomous: bool
-) -> tuple[Complex[Array, " n"], Bool[Array, ""]]:
-    """The multipliers, largest modulus first, with their structural zeros; and whether the orbit is stable."""
-    finite = jnp.all(jnp.isfinite(monodromy))
-    multipliers = jnp.linalg.eigvals(jnp.where(finite, monodromy, 0))
-    multipliers = jnp.where(finite, multipliers, jnp.nan)
-    multipliers = multipliers[jnp.argsort(-jnp.abs(lax.stop_gradient(multipliers)))]
-    n = len(multipliers)
-    multipliers = jnp.where(finite & (jnp.arange(n, dtype=zeros.dtype) >= n - zeros), 0, multipliers)
-    inside = jnp.abs(multipliers) < 1
-    if autonomous:
-        inside = inside.at[jnp.argmin(jnp.abs(multipliers - 1))].set(True)
-    return multipliers, jnp.all(inside)
 
 
 def fractions(autonomous: bool, order: int) -> tuple[list[int], np.ndarray]:

@@ -6,28 +6,24 @@ surface that repels, and for orbits that no solution follows for a whole period.
 
 from typing import Any
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
-from ._cuts import Cuts, landing, model_of, Smooth, where
+from ._arcs import Arcs, Flows, model_of, SAMPLES
+from ._cuts import Cuts, landing, where
 from ._event import cosine
 from ._filippov import Model, State
-from ._jacobian import dense_jacobian
-from ._orbit import floquet, fractions, judge, Orbit, ravel, structural_zeros
+from ._floquet import floquet, forwards, structural_zeros
+from ._orbit import fractions, judge, Orbit, ravel
 from ._saltation import fired, saltation_matrices
-from ._solution import Events, is_okay, RESULTS
-from ._solve import solve
+from ._solution import Events, RESULTS
 from ._system import frozen, System
 from ._types import Scalar, Y
-
-
-SAMPLES = 65  # of a segment, between which the guards are not looked at
 
 
 def _guard(model: Model, k: Array, t: Scalar, y: Y, state: State) -> Scalar:
@@ -43,69 +39,6 @@ def _tangency(model: Model, k: Array, t: Scalar, y: Y, state: State) -> Scalar:
     for i in model.holdable:
         out = jnp.where(k == i, jnp.abs(values[i]) - 1, out)
     return out
-
-
-class _Flows(eqx.Module):
-    """The smooth flows of all segments of a system, each divided into `pieces` of equal length."""
-
-    system: System
-    within: State
-    t0: Scalar
-    y0: Y
-    pieces: int = eqx.field(static=True)
-    how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
-
-    def piece(self, a: Scalar, b: Scalar, x: Array, state: State, saveat: dfx.SaveAt) -> Any:
-        unravel = jfu.ravel_pytree(self.y0)[1]
-        smooth = Smooth(model_of(self.system, self.t0, self.y0), state)
-        sol = solve(smooth, a, b, unravel(x), saveat=saveat, throw=False, **dict(self.how))
-        return jax.tree.map(lambda y: jnp.where(is_okay(sol.result), y, jnp.nan), jax.vmap(ravel)(sol.ys))
-
-    def rows(self, fn: Any, begin: Array, end: Array, x: Array) -> Any:
-        """`fn(a, b, x, state)` for every piece of every segment."""
-
-        def row(a: Scalar, b: Scalar, x: Array, state: State) -> Any:
-            starts = a + (b - a) * jnp.arange(self.pieces, dtype=a.dtype) / self.pieces
-            return jax.vmap(lambda a, b, x: fn(a, b, x, state))(starts, jnp.append(starts[1:], b), x)
-
-        return jax.vmap(row)(begin, end, x, self.within)
-
-    def ends(self, begin: Array, end: Array, x: Array) -> Float[Array, "rows pieces n"]:
-        def last(flows: _Flows, a: Scalar, b: Scalar, x: Array, state: State) -> Array:
-            return flows.piece(a, b, x, state, dfx.SaveAt(t1=True))[0]
-
-        return self.rows(lambda *args: dense_jacobian(last, self, *args), begin, end, x)
-
-    def paths(self, begin: Array, end: Array, x: Array) -> tuple[Array, Array, Array]:
-        """Times and states along every segment, and the derivative of its end by its beginning."""
-
-        def along(a: Scalar, b: Scalar, x: Array, state: State) -> tuple[Array, Array, Array]:
-            ts = jnp.linspace(a, b, SAMPLES)
-
-            def path(x: Array) -> tuple[Array, Array]:
-                xs = self.piece(a, b, x, state, dfx.SaveAt(ts=ts, t1=True))
-                return xs[-1], xs[:-1]
-
-            (phi, _), (_, xs) = jax.jacfwd(path)(x), path(x)
-            return ts, xs, phi
-
-        ts, xs, phis = self.rows(along, begin, end, x)
-        eye = jnp.eye(x.shape[-1], dtype=x.dtype)
-        phi = jax.vmap(lambda each: lax.scan(lambda m, phi: (phi @ m, None), eye, each)[0])(phis)
-        return ts.reshape(len(begin), -1), xs.reshape(len(begin), -1, x.shape[-1]), phi
-
-    def at(self, times: Array, begin: Array, end: Array, x: Array) -> Float[Array, "times n"]:
-        """States at given times of the orbit."""
-        starts = (
-            begin[:, None] + (end - begin)[:, None] * jnp.arange(self.pieces, dtype=end.dtype) / self.pieces
-        ).ravel()
-
-        def one(t: Scalar) -> Array:
-            i = jnp.maximum(jnp.searchsorted(starts, t, side="right") - 1, 0)
-            state = jax.tree.map(lambda s: s[i // self.pieces], self.within)
-            return self.piece(starts[i], t, x.reshape(-1, x.shape[-1])[i], state, dfx.SaveAt(t1=True))[0]
-
-        return jax.vmap(one)(times)
 
 
 @eqx.filter_jit
@@ -124,8 +57,8 @@ def by_segments(
     happened, repels = index < cuts.num, jnp.asarray(cuts.free)
     following = tuple(jnp.where(happened, jnp.roll(m, -1), m) for m in cuts.within.mode)
 
-    def flows(system: System) -> _Flows:
-        return _Flows(system, cuts.within, t0, y0, pieces, tuple(how.items()))
+    def flows(system: System) -> Flows:
+        return Flows(system, cuts.within, t0, y0, pieces, tuple(how.items()))
 
     def conditions(system: System, begin: Array, end: Array, first: Array, last: Array) -> tuple[Array, Array]:
         model = model_of(system, t0, y0)
@@ -149,8 +82,8 @@ def by_segments(
     still = frozen(system)
     begin, end, y = lax.stop_gradient((cuts.begin, cuts.end, cuts.y))
     first = jax.vmap(ravel)(y)
-    whole = _Flows(still, cuts.within, t0, y0, 1, tuple(how.items()))
-    ts, xs, _ = whole.paths(begin, end, first[:, None])
+    whole = Flows(still, cuts.within, t0, y0, 1, tuple(how.items()))
+    ts, xs = whole.paths(begin, end, first[:, None])
     x = xs[:, :: SAMPLES // pieces][:, :pieces] if pieces > 1 else first[:, None]
     field = jax.vmap(lambda t, x, s: ravel(model_of(still, t0, y0).flow(t, unravel(x), s)))
     last = xs[:, -1]
@@ -194,8 +127,10 @@ def by_segments(
     )
     result = judge(good, x[0, 0], later, autonomous, order)
 
-    ts, xs, phi = flows(system).paths(begin, end, x)
-    events = _log(system, cuts, following, end, xs[:, -1], jumps(system, end, xs[:, -1]), unravel)
+    ts, xs = flows(still).paths(*lax.stop_gradient((begin, end, x)))
+    last = flows(system).ends(begin, end, x)[:, -1]
+    phi = flows(system).derivatives(begin, end, x)
+    events = _log(system, cuts, following, end, last, jumps(system, end, last), unravel)
     monodromy, multipliers, stable, zeros = _floquet(system, cuts, events, happened, phi, autonomous)
     violation, violation_t = _violation(model_of(still, t0, y0), cuts, ts, xs, unravel)
     admissible = (violation == 0) & jnp.all(end - begin >= -1e3 * tol * (1 + jnp.abs(period)))
@@ -216,6 +151,7 @@ def by_segments(
         violation=violation,
         violation_t=violation_t,
         result=result,
+        arcs=Arcs(begin, end, _modes(cuts.within.mode, begin), jax.vmap(jax.vmap(unravel))(x)),
         options=tuple(how.items()),
     )
 
@@ -255,15 +191,15 @@ def _floquet(
     system: System, cuts: Cuts, events: Events, happened: Array, phi: Array, autonomous: bool
 ) -> tuple[Array, Array, Array, Array]:
     """Monodromy matrix, multipliers, stability and structural zeros, from the derivatives along the segments."""
-    n = phi.shape[-1]
-    eye = jnp.eye(n, dtype=phi.dtype)
+    eye = jnp.eye(phi.shape[-1], dtype=phi.dtype)
+    none = jnp.broadcast_to(eye, (len(phi), *eye.shape))
     zeros = structural_zeros(system, _modes(cuts.within.mode, happened))
     if not any(cuts.free):
-        jumps = where(happened, saltation_matrices(system, events), jnp.broadcast_to(eye, phi.shape))
-        monodromy = lax.scan(lambda m, row: (row[1] @ row[0] @ m, None), eye, (phi, jumps))[0]
-        return monodromy, *floquet(monodromy, zeros, autonomous), zeros
-    # Backwards in time a surface that repels attracts, and the multipliers are the reciprocals: what leaves the surface
-    # freely comes onto it there, and has a saltation matrix. Where it comes onto the surface, tangentially, none is.
+        jumps = where(happened, saltation_matrices(system, events), none)
+        factors = jnp.concatenate([phi, jumps[:, None]], axis=1).reshape(-1, *eye.shape)
+        return *floquet(factors, zeros, autonomous), zeros
+    # Backwards in time a surface that repels attracts: what leaves the surface freely comes onto it there, and has a
+    # saltation matrix. Where it comes onto the surface, tangentially, none is.
     free = jnp.asarray(cuts.free)
     before, after = (
         jnp.where(free[:, None], *pair)
@@ -273,13 +209,11 @@ def _floquet(
     jumps = saltation_matrices(system, swapped)
     tangent = jnp.roll(free, -1)
     ordinary = happened & ~free & ~tangent
-    back = jnp.where(free[:, None, None], jumps, eye)
-    back = where(ordinary, jnp.linalg.inv(where(ordinary, jumps, jnp.broadcast_to(eye, phi.shape))), back)
-    backwards = lax.scan(lambda m, row: (m @ jnp.linalg.solve(row[0], row[1]), None), eye, (phi, back))[0]
-    infinite = sum(cuts.free)
-    multipliers, _ = floquet(backwards, jnp.asarray(infinite, jnp.int32), autonomous)
-    multipliers = jnp.where(multipliers == 0, jnp.inf, 1 / jnp.where(multipliers == 0, 1, multipliers))[::-1]
-    return jnp.full_like(eye, jnp.inf), multipliers, jnp.zeros((), bool), zeros
+    back = where(free, jumps, none)
+    back = where(ordinary, jnp.linalg.inv(where(ordinary, jumps, none)), back)
+    factors = jnp.concatenate([jnp.linalg.inv(phi), back[:, None]], axis=1).reshape(-1, *eye.shape)
+    infinite = jnp.asarray(sum(cuts.free), jnp.int32)
+    return *forwards(floquet(factors[::-1], infinite, autonomous), infinite, autonomous), zeros
 
 
 def _violation(model: Model, cuts: Cuts, ts: Array, xs: Array, unravel: Any) -> tuple[Scalar, Scalar]:

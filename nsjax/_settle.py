@@ -81,7 +81,7 @@ def settle(
         if k in model.holdable:
             # A repulsive surface is left to the other side: beyond |λ| = 1 both fields point there.
             forced = jnp.where(repels[k], -leaves[k], leaves[k])
-            passes = repels[k] & (came[k] != 0)
+            passes = repels[k] & (came[k] != 0) & ~_grips(model, k, s[k])
             trial[k] = jnp.where(at[k] & (forced != 0), forced, jnp.where(at[k] & passes, -came[k], trial[k]))
         else:
             unmoved = jnp.where(came[k] == 0, 1, came[k])
@@ -100,7 +100,7 @@ def settle(
         for k in which:
             if k in model.holdable and k not in model.contacts:
                 over = s[k] * came[k].astype(t.dtype) / model.bound(k) - 1
-                tied = at[k] & (came[k] != 0) & ~repels[k] & (leaves[k] == 0) & (jnp.abs(over) <= _nearly(t))
+                tied = at[k] & (came[k] != 0) & ~repels[k] & (leaves[k] == 0) & (jnp.abs(over) <= nearly(t))
                 leaves[k] = jnp.where(tied, came[k], leaves[k])
                 trial[k] = jnp.where(tied, came[k], trial[k])
 
@@ -134,8 +134,7 @@ def settle(
             edge = jnp.zeros((), jnp.int32)
             if k in model.holdable:
                 # What begins to be held with λ at its bound need not leave: where λ goes decides.
-                over = jnp.abs(s[k]) >= (1 - _nearly(t)) * model.bound(k)
-                edge = jnp.where(over, jnp.sign(s[k]).astype(jnp.int32), 0)
+                edge = model.edge(k, s[k], nearly(t))
             unsure = unsure | (at[k] & (trial[k] == 0) & (slopes[k] > 0) & (came[k] == 0))
         held = model.held(k, trial[k]) if k in model.holdable else False
         roots[k] = jnp.where(at[k], jnp.where(held, edge, fresh), roots[k]).astype(jnp.int32)
@@ -149,7 +148,15 @@ def forks(model: Model, k: int, multiplier: Scalar, slope: Scalar) -> Bool[Array
 
     The rule is that a repulsive surface is crossed, and that static friction holds."""
     size = jnp.abs(multiplier)
-    return (size <= model.bound(k)) & ((slope > 0) | (size > 1 + _nearly(size)))
+    return (size <= model.bound(k)) & ((slope > 0) | (size > 1 + nearly(size)))
+
+
+def _grips(model: Model, k: int, multiplier: Scalar) -> Bool[Array, ""]:
+    """Whether, running backwards, static friction holds what arrives. It does not where |λ| < 1: there nothing does."""
+    if not model.static(k):
+        return jnp.zeros((), bool)
+    size = jnp.abs(multiplier)
+    return (model.direction < 0) & (size > 1 + nearly(size)) & (size <= (1 + nearly(size)) * model.bound(k))
 
 
 def _noise(model: Model, t: Scalar, y: Y, state: State, which: tuple, s: dict) -> dict:
@@ -162,7 +169,7 @@ def _noise(model: Model, t: Scalar, y: Y, state: State, which: tuple, s: dict) -
     return {k: zero for k in which} | dict(zip(model.contacts, blurs))
 
 
-def _nearly(like: Scalar) -> float:
+def nearly(like: Scalar) -> float:
     """How closely two bounds must be reached to count as reached together."""
     return max(1e-10, 64 * float(jnp.finfo(like.dtype).eps))
 
@@ -181,7 +188,7 @@ def _best(
         s, rates, slopes = look(mode)
         valid, held, kept = jnp.ones((), bool), jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
         for i, k in enumerate(which):
-            small = _nearly(t) * jnp.abs(slopes[k])
+            small = nearly(t) * jnp.abs(slopes[k])
             if k in model.contacts:
                 stays = row[i] == 1
                 law = jnp.where(
@@ -198,9 +205,9 @@ def _best(
                     forced = (row[i] == forced) & (opening >= -1e-6 * jnp.abs(slopes[k]))
                     goes = jnp.where(leaves[k] == 0, goes, forced)
                     bound = model.bound(k)
-                    left = (came[k] != 0) & (s[k] * came[k].astype(t.dtype) >= (1 - _nearly(t)) * bound)
-                    attracts = (slopes[k] < 0) | (came[k] == 0)
-                    sticks = (jnp.abs(s[k]) <= (1 + _nearly(t)) * bound) & (leaves[k] == 0) & attracts & ~left
+                    left = (came[k] != 0) & (s[k] * came[k].astype(t.dtype) >= (1 - nearly(t)) * bound)
+                    attracts = (slopes[k] < 0) | (came[k] == 0) | _grips(model, k, s[k])
+                    sticks = (jnp.abs(s[k]) <= (1 + nearly(t)) * bound) & (leaves[k] == 0) & attracts & ~left
                 else:
                     crosses = (leaves[k] != 0) & (came[k] != 0)
                     unmoved = jnp.where(came[k] == 0, 1, came[k])

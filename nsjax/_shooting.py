@@ -12,11 +12,13 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array
 
+from ._arcs import Arcs
 from ._filippov import Model
+from ._floquet import floquet, forwards, structural_zeros
 from ._guess import at_start, base_point
 from ._jacobian import dense_jacobian
-from ._orbit import distance, floquet, fractions, judge, Orbit, ravel, structural_zeros
-from ._solution import is_okay, RESULTS
+from ._orbit import distance, fractions, judge, Orbit, ravel
+from ._solution import Events, is_okay, RESULTS
 from ._solve import solve
 from ._system import frozen, System
 from ._types import Scalar, Y
@@ -31,25 +33,30 @@ def shoot(
     period: Scalar,
     order: int,
     symmetry: Callable[[Y], Y] | None,
+    backward: bool,
     mode: Any,
     how: dict,
     tol: float,
     max_iterations: int,
 ) -> Orbit:
-    """Newton's method on y(t0 + period) = y0, or y(t0 + period/2) = `symmetry`(y0), and what is said of the orbit."""
+    """Newton's method on y(t0 + period) = y0, or y(t0 + period/2) = `symmetry`(y0), and what is said of the orbit.
+
+    With `backward` on y(t0 - period) = y0; what is said is of the orbit as it runs forwards.
+    """
+    sign = -1.0 if backward else 1.0
     autonomous = system.period is None
     still = frozen(system)
     model = Model(still, jnp.ones_like(t0), t0, y0)
     guess = lax.stop_gradient(y0)
     if autonomous:
-        guess, period = lax.stop_gradient(base_point(still, t0, guess, lax.stop_gradient(period), mode, how))
+        guess, period = lax.stop_gradient(base_point(still, t0, guess, lax.stop_gradient(period), sign, mode, how))
         mode = None
     flat, unravel = jfu.ravel_pytree(guess)
     first_period = lax.stop_gradient(period)
     forcing = None if autonomous else jnp.asarray(system.period, t0.dtype) * order
 
     def flow(system: System, x: Array, period: Scalar) -> Array:
-        sol = solve(system, t0, t0 + period, unravel(x), mode=mode, throw=False, **how)
+        sol = solve(system, t0, t0 + sign * period, unravel(x), mode=mode, throw=False, **how)
         # A solution that ended early is no solution: Newton's method must not be led by it.
         ok = is_okay(sol.result)
         return jnp.where(ok, ravel(sol.y1), jnp.nan)
@@ -96,9 +103,10 @@ def shoot(
         period = forcing
 
     _, shares = fractions(autonomous, order)
+    end = t0 + sign * period
     sol = solve(
-        system, t0, t0 + period, unravel(x), mode=mode, throw=False, **how,
-        saveat=dfx.SaveAt(ts=t0 + period * jnp.asarray(shares, t0.dtype), t1=True),
+        system, t0, end, unravel(x), mode=mode, throw=False, **how,
+        saveat=dfx.SaveAt(ts=t0 + sign * period * jnp.asarray(shares, t0.dtype), t1=True),
     )  # fmt: skip
     points = jax.vmap(ravel)(sol.ys)
     error = distance(points[-1], x)
@@ -111,16 +119,23 @@ def shoot(
         at_rest = at_rest | (jnp.max(jnp.abs(last)) * first_period <= 1e-6 * size)
         result = RESULTS.where(at_rest, RESULTS.orbit_is_equilibrium, result)
 
+    begin, stop, y, modes = arcs(sol, t0, unravel(x))
+    along, events = Arcs(begin, stop, modes, jax.tree.map(lambda y: y[:, None], y)), sol.events
+    zeros = structural_zeros(system, modes)
     monodromy = monodromy_by_arcs(system, sol, t0, unravel(x), how["solver"], how["stepsize_controller"])
-    zeros = structural_zeros(system, arcs(sol, t0, unravel(x))[3])
-    multipliers, stable = floquet(monodromy, zeros, autonomous)
+    found_out = floquet(monodromy[None], zeros, autonomous)
+    if backward:
+        found_out = forwards(found_out, zeros, autonomous)
+        along, events = _reversed(along, events, unravel(x), period)
+        zeros = jnp.zeros_like(zeros)
+    monodromy, multipliers, stable = found_out
     return Orbit(
         system=system,
         t0=t0,
         y0=unravel(x),
         mode=sol.mode0,
         period=period,
-        events=sol.events,
+        events=events,
         monodromy=monodromy,
         multipliers=multipliers,
         structural_zeros=zeros,
@@ -129,6 +144,43 @@ def shoot(
         admissible=jnp.ones((), bool),
         violation=jnp.zeros_like(t0),
         violation_t=t0,
+        arcs=along,
         result=result,
         options=tuple(how.items()),
     )
+
+
+def _reversed(arcs: Arcs, events: Events, y0: Y, period: Scalar) -> tuple[Arcs, Events]:
+    """The arcs and the events of a solution over one period backwards, as they follow each other forwards."""
+    num = events.num
+
+    def back(leaf: Array, count: Array) -> Array:
+        """The first `count` rows in reverse."""
+        index = jnp.arange(len(leaf), dtype=count.dtype)
+        return leaf[jnp.where(index < count, count - 1 - index, index)]
+
+    def log(leaf: Array) -> Array:
+        return back(leaf, num)
+
+    before, after, y_before, y_after = jax.tree.map(
+        log, (events.mode_after, events.mode_before, events.y_after, events.y_before)
+    )
+    ends = (log(events.t) + period, log(events.switch), before, after, y_before, y_after, log(events.transversality))
+    turned = eqx.tree_at(
+        lambda e: (e.t, e.switch, e.mode_before, e.mode_after, e.y_before, e.y_after, e.transversality), events, ends
+    )
+    # An arc begins where, backwards, it ended: after the event that ends it there, or at the base point.
+    rows = len(arcs.begin)
+    happened = jnp.arange(rows - 1, dtype=num.dtype) < num
+
+    def starts(first: Array, later: Array) -> Array:
+        held = happened.reshape((-1,) + (1,) * (later.ndim - 1))
+        return jnp.concatenate([first[None], jnp.where(held, later, first)])[:, None]
+
+    used = jnp.arange(rows, dtype=num.dtype) <= num
+
+    def times(t: Array) -> Array:
+        return jnp.where(used, back(t, num + 1) + period, t + 2 * period)  # the others stay at the end
+
+    mode = back(arcs.mode, num + 1)
+    return Arcs(times(arcs.end), times(arcs.begin), mode, jax.tree.map(starts, y0, y_after)), turned

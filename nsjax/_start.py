@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from ._filippov import Model, State
-from ._settle import forks, settle
+from ._settle import forks, nearly, settle
 from ._solution import RESULTS
-from ._system import impact, relay
+from ._system import frozen, impact, relay
 from ._types import Scalar, Y
 
 
@@ -72,6 +72,10 @@ def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[St
     # Guards of surfaces on which the start lies have a root there already.
     roots = list(state.roots)
     f = model.flow(t, y, state)
+    for k, value in enumerate(frozen(model.values(t, y, state))):
+        if model.static(k) and k in model.holdable:
+            edge = jnp.where(model.direction < 0, model.edge(k, value, nearly(t)), 0)
+            roots[k] = jnp.where((state.mode[k] == 0) & ~at[k], edge, roots[k])
     for k, here in on.items():
         rate = model.approach(k, t, y, state)
         sign = 1 - state.mode[k] if isinstance(model.switches[k], impact) else state.mode[k]

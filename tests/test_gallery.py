@@ -58,6 +58,11 @@ def support(t, x, v):  # (3.53), (3.54)
     return v, -x + np.cos(1.2 * t)
 
 
+def hopf_pitchfork(t, x1, x2, mu=-1.0):  # (5.32)
+    kinks = abs(x1 + mu) - abs(x1 - mu) - abs(x2 + mu) + abs(x2 - mu)
+    return x2, -x1 - x2 + kinks
+
+
 def trilinear(t, x, v):  # (6.14)-(6.16)
     stiffness, damping = x, 0.05 * v
     if x > 1 and 4 * (x - 1) + 0.5 * v >= 0:
@@ -100,6 +105,7 @@ FIELDS = {
     "2.4": falling_stick_slip,
     "3.4": stick_slip,
     "3.5": support,
+    "5.7": hopf_pitchfork,
     "6.6": trilinear,
     "6.7": lambda t, x, v: stick_slip(t, x, v, c=0.1),
     "6.8": forced_friction,

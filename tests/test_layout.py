@@ -37,6 +37,8 @@ ORDER = (
     "_solve",
     "_saltation",
     "_variational",
+    "_arcs",
+    "_floquet",
     "_regularise",
     "_sweep",
     "_orbit",

@@ -3,6 +3,7 @@
 `thesis("6.6")` is the system of section 6.6 with the values of Appendix C; `THESIS` lists them all.
 """
 
+from ._absolute import HopfPitchfork as HopfPitchfork
 from ._block import (
     FallingFrictionBlock as FallingFrictionBlock,
     Slip as Slip,

@@ -9,6 +9,7 @@ from typing import Any
 
 from .._system import System
 from .._types import Y
+from ._absolute import HopfPitchfork
 from ._block import FallingFrictionBlock, Slip, SmoothBlock, StaticPointBlock
 from ._examples import (
     AttractionSliding,
@@ -108,6 +109,14 @@ _ENTRIES = (
         y0=Motion(0.5, 0.0),
         t1=80.0,
         orbit=OrbitGuess(Motion(1.110, 1.338)),
+    ),
+    Entry(
+        "5.7",
+        "Hopf-pitchfork bifurcation of a non-smooth continuous system",
+        HopfPitchfork,
+        y0=Plane(0.5, 0.0),
+        t1=20.0,
+        orbit=OrbitGuess(Plane(1.5, 0.0), period=4.03),
     ),
     Entry(
         "6.6",

@@ -1,0 +1,101 @@
+"""The orbits of chapters 5 and 6, stable and unstable, from plausible guesses, against 40-digit references."""
+
+import diffrax as dfx
+import jax.numpy as jnp
+import numpy as np
+import orbit_reference
+import pytest
+from models import Motion, pid
+
+import nsjax
+from nsjax import find_orbit, gallery, RESULTS
+
+
+METHOD = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-13), max_steps=8192, max_events=16)
+
+
+class Stop(nsjax.System):
+    """x'' + c x' + x = f_0 cos ωt, x <= gap with restitution e."""
+
+    e: float = 0.7
+    c: float = 0.1
+    f_0: float = 1.0
+    gap: float = 0.2
+    omega: float = 1.3
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, self.f_0 * jnp.cos(self.omega * t) - self.c * y.v - y.x - s.stop)
+
+    @nsjax.impact
+    def stop(self, t, y):
+        return self.gap - y.x
+
+    @stop.restitution
+    def stop(self):
+        return self.e
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+def cases(system, reference, keys, slow):
+    mark = (pytest.mark.slow,) if slow else ()
+    return [pytest.param(system, reference, key, marks=mark, id=f"{system.__name__}-{key}") for key in keys]
+
+
+SHOTS = (
+    *cases(Stop, orbit_reference.impact_orbit, orbit_reference.IMPACT, False),
+    *cases(gallery.ForcedStickSlip, orbit_reference.forced_stick_slip_orbit, orbit_reference.STICK_SLIP, False),
+    *cases(gallery.ForcedFriction, orbit_reference.friction_orbit, orbit_reference.FRICTION, True),
+    *cases(gallery.Trilinear, orbit_reference.trilinear_orbit, orbit_reference.TRILINEAR, True),
+)
+
+
+def search(system, shot, **options):
+    """From two digits of a state at t = 0."""
+    return find_orbit(
+        system(**shot.parameters), Motion(*shot.guess), order=shot.order, throw=False, **(METHOD | options)
+    )
+
+
+def check(orbit, shot):
+    assert orbit.result == RESULTS.successful
+    np.testing.assert_allclose([orbit.y0.x, orbit.y0.v], shot.y0, atol=1e-10)
+    np.testing.assert_allclose(orbit.period, shot.period, rtol=1e-14)
+    np.testing.assert_allclose([float(e.t) for e in orbit.events], [e[0] for e in shot.events], atol=1e-10)
+    # Conjugate pairs come in either order.
+    np.testing.assert_allclose(np.abs(orbit.multipliers), np.abs(shot.multipliers), atol=1e-8)
+    np.testing.assert_allclose(np.real(orbit.multipliers), np.real(shot.multipliers), atol=1e-8)
+    assert orbit.stable == shot.stable and orbit.admissible
+
+
+@pytest.mark.parametrize("system, reference, key", SHOTS)
+def test_shooting(system, reference, key):
+    shot = reference(key)
+    check(search(system, shot), shot)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("system, reference, key", SHOTS)
+def test_segments(system, reference, key):
+    shot = reference(key)
+    check(search(system, shot, method="segments"), shot)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["shooting", "segments"])
+def test_section_5_7(method):
+    """Eight kinks in a period; size, but not period, in proportion to μ."""
+    exact = orbit_reference.hopf_pitchfork_orbit()
+    np.testing.assert_allclose(exact.period, 4.03, atol=5e-3)  # the thesis's figure
+    for size in 1.0, 0.3:
+        orbit = find_orbit(
+            gallery.thesis("5.7", mu=-size), gallery.Plane(1.5 * size, 0.0), period=4.0, method=method, **METHOD
+        )
+        np.testing.assert_allclose(orbit.period, exact.period, atol=1e-10)
+        np.testing.assert_allclose(orbit.multipliers, exact.multipliers, atol=1e-8)
+        assert list(orbit.trivial) == [True, False] and orbit.stable and len(orbit.events) == 8
+        kinks = sorted(tuple(np.round([*e.y_after], 9)) for e in orbit.events)
+        want = sorted(tuple(np.round(np.multiply(size, e[2:4]), 9)) for e in exact.events)
+        np.testing.assert_allclose(kinks, want, atol=2e-9)
