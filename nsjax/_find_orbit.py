@@ -17,7 +17,7 @@ from ._guess import repeats, settle_down
 from ._orbit import Orbit, ravel
 from ._segments import by_segments
 from ._shooting import shoot
-from ._solution import raise_if, RESULTS
+from ._solution import is_okay, raise_if, RESULTS
 from ._sweep import sweep
 from ._system import arrays_of, frozen, System
 from ._types import Scalar, Y
@@ -88,7 +88,8 @@ def find_orbit(
     - `tol`: tolerance of Newton's method, by default 1e-10 (float32: 1e-4).
     - `throw`: whether a failure raises; if not, look at `Orbit.result`.
 
-    **Returns:** an `Orbit`.
+    **Returns:** an `Orbit`. Its result is `RESULTS.tangential_event`, which is no failure, if it grazes a surface: the
+    orbit is right, but its multipliers are not defined.
 
     **Raises:** a runtime error that says whether the search ended in an equilibrium, in a multiple cover of a shorter
     orbit, or nowhere.
@@ -149,7 +150,7 @@ def find_orbit(
             for more in (1, 8):
                 if orbit.result == RESULTS.orbit_not_found:
                     other = search(y0, period, order, mode, more)
-                    orbit = other if other.result == RESULTS.successful else orbit
+                    orbit = other if is_okay(other.result) else orbit
         return orbit
 
     if segments is not None:
@@ -169,15 +170,15 @@ def find_orbit(
         if concrete and not period > 0:
             raise ValueError(f"Argument `period` must be positive, but got {period}.")
         orbit = tries(y0, period, order, given)
-        if concrete and bool((orbit.result != RESULTS.successful) & (orbit.result != RESULTS.orbit_is_multiple_cover)):
+        if concrete and not bool(is_okay(orbit.result) | (orbit.result == RESULTS.orbit_is_multiple_cover)):
             y1, period, rests = settle_down(system, t0, y0, sign, given, how)
             if rests:
                 orbit = eqx.tree_at(lambda o: o.result, orbit, RESULTS.orbit_is_equilibrium)
             if period > 0:
                 second = tries(y1, period, order, None)
-                orbit = second if bool(second.result == RESULTS.successful) else orbit
+                orbit = second if bool(is_okay(second.result)) else orbit
     if throw:
-        orbit = raise_if(orbit.result != RESULTS.successful, orbit.result, orbit)
+        orbit = raise_if(~is_okay(orbit.result), orbit.result, orbit)
     return orbit
 
 
@@ -207,7 +208,7 @@ def find_orbits(system: System, starts: Y, *, period: Any = None, order: int = 1
     batch = sweep(one, (starts, guesses))
     arrays, static = eqx.partition(batch, eqx.is_array)
     found: list[list[Any]] = []
-    for i in np.flatnonzero(np.asarray(batch.result == RESULTS.successful)):
+    for i in np.flatnonzero(np.asarray(is_okay(batch.result))):
         orbit = eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static)
         known = next((entry for entry in found if _same(entry[1], entry[2], orbit)), None)
         if known is None:

@@ -21,7 +21,7 @@ from ._filippov import Model, State
 from ._floquet import floquet, forwards, structural_zeros
 from ._orbit import fractions, judge, Orbit, ravel
 from ._saltation import fired, saltation_matrices
-from ._solution import Events, RESULTS
+from ._solution import Events, is_okay, RESULTS
 from ._system import frozen, System
 from ._types import Scalar, Y
 
@@ -132,9 +132,13 @@ def by_segments(
     phi = flows(system).derivatives(begin, end, x)
     events = _log(system, cuts, following, end, last, jumps(system, end, last), unravel)
     monodromy, multipliers, stable, zeros = _floquet(system, cuts, events, happened, phi, autonomous)
+    # Where a free segment begins it is tangential that it must be.
+    meant = jnp.roll(repels, -1)
+    grazes = jnp.any(happened & ~meant & (events.transversality < jnp.cbrt(jnp.finfo(end.dtype).eps)))
     violation, violation_t = _violation(model_of(still, t0, y0), cuts, ts, xs, unravel)
     admissible = (violation == 0) & jnp.all(end - begin >= -1e3 * tol * (1 + jnp.abs(period)))
-    result = RESULTS.where((result == RESULTS.successful) & ~admissible, RESULTS.orbit_not_admissible, result)
+    result = RESULTS.where((result == RESULTS.successful) & grazes, RESULTS.tangential_event, result)
+    result = RESULTS.where(is_okay(result) & ~admissible, RESULTS.orbit_not_admissible, result)
     return Orbit(
         system=system,
         t0=t0,

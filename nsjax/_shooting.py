@@ -119,6 +119,8 @@ def shoot(
         at_rest = at_rest | (jnp.max(jnp.abs(last)) * first_period <= 1e-6 * size)
         result = RESULTS.where(at_rest, RESULTS.orbit_is_equilibrium, result)
 
+    grazes = (sol.result == RESULTS.tangential_event) & (result == RESULTS.successful)
+    result = RESULTS.where(grazes, RESULTS.tangential_event, result)
     begin, stop, y, modes = arcs(sol, t0, unravel(x))
     along, events = Arcs(begin, stop, modes, jax.tree.map(lambda y: y[:, None], y)), sol.events
     zeros = structural_zeros(system, modes)

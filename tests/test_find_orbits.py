@@ -34,8 +34,19 @@ def test_rings():
         rate = (2 * r**2 * (4 - r**2) - 2 * r**2 * (r**2 - 1)) / 20
         other = np.exp(2 * np.pi * rate)
         np.testing.assert_allclose(np.sort(orbit.multipliers.real), sorted([1, other]), rtol=1e-8)
-        assert orbit.stable == (r > 1.5)
+        assert orbit.stable == (r > 1.5) and orbit.trivial.sum() == 1
+        # The Poincaré map (6.7), whatever its section.
+        for normal in None, Motion(0.3, 1.0) if abs(orbit.y0.x) > 0.5 else Motion(1.0, 0.1):
+            found = np.linalg.eigvals(orbit.poincare_derivative(normal))
+            np.testing.assert_allclose(sorted(found.real), sorted([0, other]), atol=1e-8)
         assert np.isclose(orbit.period, 2 * np.pi, rtol=1e-11)
+
+
+def test_symmetric():
+    """y(t + T/2) = -y(t), by half of the period, of an autonomous system."""
+    orbit = find_orbit(Rings(), Motion(1.9, 0.1), period=6.2, symmetry="inversion", **METHOD)
+    np.testing.assert_allclose(np.hypot(*orbit.y0), 2, atol=1e-10)
+    np.testing.assert_allclose(orbit.period, 2 * np.pi, atol=1e-10)
 
 
 def test_none():

@@ -198,3 +198,125 @@ def test_mistakes_are_named():
     batch = jax.tree.map(lambda x: x[None] if isinstance(x, jax.Array) else x, ball())
     with pytest.raises(ValueError, match="batch"):
         plot.phase_portrait(batch)
+
+
+# Orbits.
+
+
+LOOSE = dict(
+    solver=dfx.Tsit5(), stepsize_controller=dfx.PIDController(rtol=1e-9, atol=1e-9), max_steps=512, max_events=8
+)
+
+
+@functools.cache
+def stable():
+    return nsjax.find_orbit(gallery.StickSlip(c=0.1, v_dr=0.5), gallery.Motion(1.0, -1.1), period=7.6, **LOOSE)
+
+
+@functools.cache
+def infinitely_unstable():
+    segments = [nsjax.Segment(-1, 3.0), nsjax.Segment(0, 1.0, free=True), nsjax.Segment(-1, 2.5)]
+    return nsjax.find_orbit(stable().system, gallery.Motion(1.0, -0.575), segments=segments, **LOOSE)
+
+
+def images(ax):
+    """The corners of all images of which the tube is made."""
+    return np.concatenate([[path.vertices for path in c.get_paths()] for c in ax.collections if c.get_zorder() == 0.5])
+
+
+def drawn(ax, label):
+    return next(line.get_xydata() for line in ax.get_lines() if line.get_label() == label)
+
+
+def area(polygon):
+    x, y = np.asarray(polygon).T
+    return abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
+
+
+def test_perturbation_tube():
+    orbit = stable()
+    ax = plot.perturbation_tube(orbit, radius=(0.1, 0.05), labels={"x": "x [m]", "v": "v [m/s]"})
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "v [m/s]")
+    assert legend_names(ax)[:2] == ["perturbations", "one period later"]
+    base, shape = np.array(orbit.y0), np.array([0.1, 0.05])
+    first, last = drawn(ax, "perturbations") - base, drawn(ax, "one period later") - base
+    np.testing.assert_allclose(np.linalg.norm(first / shape, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(last, first @ np.asarray(orbit.monodromy).T, atol=1e-8)
+    # Liouville: up to the catch the area shrinks by exp(-c t / m); from then on there is none.
+    polygons = images(ax)
+    areas, middle = np.array([area(p[:-1]) for p in polygons]), polygons[:, :-1].mean(axis=1)
+    stick, slip = orbit.events
+    before = np.array([np.ptp(p[:, 1]) > 1e-9 and a > 1e-9 for p, a in zip(polygons, areas)])
+    assert before[0] and not before[-1]
+    assert np.all(np.diff(before.astype(int)) <= 0)
+    np.testing.assert_allclose(areas[~before], 0, atol=1e-12)
+    np.testing.assert_allclose(areas[before][-1] / area(first[:-1]), np.exp(-0.1 * stick.t), rtol=5e-3)
+    # In stick the image moves with the belt: all of it, on it.
+    on_belt = np.ptp(polygons[..., 1], axis=1) < 1e-9
+    assert on_belt.any() and np.all((middle[on_belt, 0] > stick.y_after.x) & (middle[on_belt, 0] < slip.y_before.x))
+    np.testing.assert_allclose(polygons[on_belt][..., 1], 0.5, atol=1e-9)
+
+
+def test_perturbation_tube_takes_axes_and_components():
+    ax = plt.figure().add_subplot()
+    given = plot.perturbation_tube(stable(), "v", "x", ellipses=5, samples=50, ax=ax, legend=False, surfaces=False)
+    assert given is ax and (ax.get_xlabel(), ax.get_ylabel()) == ("v", "x") and ax.get_legend() is None
+    assert 50 <= len(images(ax)) <= 53 and sum(line.get_linewidth() == 0.8 for line in ax.get_lines()) == 5
+    # By default a twentieth of the extent, along both axes.
+    extent = np.ptp(np.concatenate([[arc.y["v"], arc.y["x"]] for arc in arcs(stable().solve())], axis=1), axis=1)
+    np.testing.assert_allclose(np.ptp(drawn(ax, "perturbations"), axis=0), extent / 10, rtol=1e-12)
+
+
+def test_mistakes_with_a_tube_are_named():
+    with pytest.raises(ValueError, match="leaves a surface that repels"):
+        plot.perturbation_tube(infinitely_unstable())
+    with pytest.raises(ValueError, match="must be an `Orbit`, but is of type Solution"):
+        plot.perturbation_tube(stick_slip())
+    with pytest.raises(ValueError, match="no component 'z'"):
+        plot.perturbation_tube(stable(), "z")
+    for radius in (0.0, -1.0, np.nan, (0.1, 0.0)):
+        with pytest.raises(ValueError, match="`radius` must be positive"):
+            plot.perturbation_tube(stable(), radius=radius)
+    with pytest.raises(ValueError, match="`samples` must be a positive integer"):
+        plot.perturbation_tube(stable(), samples=0)
+
+
+def test_an_orbit_that_no_solution_follows_is_drawn_arc_by_arc():
+    """It leaves the belt long before F_stick is reached: a solution does not."""
+    orbit = infinitely_unstable()
+    onto, off = orbit.events
+    ax = plot.phase_portrait(orbit)
+    (slides,) = [line for line in thick(ax) if len(line.get_xdata())]
+    np.testing.assert_allclose(slides.get_xdata()[[0, -1]], [onto.y_after.x, off.y_before.x], atol=1e-4)
+    ends = [line.get_xydata() for line in ax.get_lines() if line.get_label() == "belt < 0"]
+    np.testing.assert_allclose(ends[-1][-1], orbit.y0, atol=1e-7)
+    # Unstable orbits are dashed, and the legend says so; a stable one beside it is not.
+    assert slides.is_dashed() and "unstable" in legend_names(ax)
+    both = plot.phase_portrait(stable(), surfaces=False)
+    plot.phase_portrait(orbit, ax=both)
+    assert [line.is_dashed() for line in thick(both) if len(line.get_xdata())] == [False, True]
+    handle = both.get_legend().legend_handles[legend_names(both).index("belt < 0")]
+    assert not handle.is_dashed()
+    assert plot.time_series(orbit).get_lines()[0].get_xdata()[0] == 0
+
+
+def test_infinite_multipliers_stand_at_the_edge():
+    ax = plot.multipliers(infinitely_unstable())
+    (arrow,) = [line for line in ax.get_lines() if line.get_marker() == ">"]
+    assert arrow.get_transform() == ax.get_yaxis_transform() and arrow.get_xydata().tolist() == [[1.0, 0.0]]
+    assert [text.get_text() for text in ax.texts] == ["∞"]
+    (trivial,) = [line for line in ax.get_lines() if line.get_marker() == "o"]
+    np.testing.assert_allclose(trivial.get_xydata(), [[1.0, 0.0]], atol=1e-8)
+    assert trivial.get_markerfacecolor() == "white"
+
+
+def test_multipliers_of_several_orbits():
+    ax = plot.multipliers([stable(), infinitely_unstable()])
+    assert {"orbit 1, stable", "orbit 2, unstable", "along the orbit"} == set(legend_names(ax))
+    assert sum(len(line.get_xdata()) == 361 for line in ax.get_lines()) == 1
+    assert {line.get_marker() for line in ax.get_lines() if line.get_label() == "orbit 1, stable"} == {"o"}
+    with pytest.raises(ValueError, match="empty"):
+        plot.multipliers([])
+    failed = types.SimpleNamespace(multipliers=np.full(2, np.nan), system=types.SimpleNamespace(period=None))
+    with pytest.raises(ValueError, match="was found"):
+        plot.multipliers(failed)

@@ -52,6 +52,51 @@ def test_infinitely_unstable(v_dr):
     assert "multipliers  inf" in str(orbit)
 
 
+@pytest.mark.parametrize("v_dr", [0.2, 0.5, 1.0])
+def test_backward_shooting(v_dr):
+    """The same orbits, from nothing but a start beside them and a period, in backward time."""
+    orbit = backward(v_dr, 0.1)
+    slip, x, period = reference.infinitely_unstable_orbit(0.1, v_dr)
+    np.testing.assert_allclose(orbit.period, period, atol=1e-11)
+    assert list(orbit.itinerary) == [{"belt": -1}, {"belt": 0}, {"belt": -1}]
+    onto, off = orbit.events  # as it runs forwards
+    assert 0 < onto.t < off.t < orbit.period
+    np.testing.assert_allclose([*onto.y_before, *off.y_after], [1 - 0.1 * v_dr, v_dr, x, v_dr], atol=1e-11)
+    np.testing.assert_allclose(float(off.t - onto.t), period - slip, atol=1e-11)
+    np.testing.assert_allclose(orbit.multipliers[1], 1, atol=1e-10)
+    assert np.isinf(orbit.multipliers[0]) and np.all(np.isinf(orbit.monodromy)) and not orbit.stable
+    assert list(orbit.trivial) == [False, True] and orbit.structural_zeros == 0
+    # By segments: where it comes onto the surface, and when it leaves.
+    again = unstable(v_dr)
+    for a, b in zip(orbit.events, again.events):
+        np.testing.assert_allclose([*b.y_before, *b.y_after], [*a.y_before, *a.y_after], atol=1e-10)
+    np.testing.assert_allclose(again.period, orbit.period, atol=1e-10)
+    for o in orbit, again:
+        path = o.path(9)
+        length = (path.t[:, -1] - path.t[:, 0])[:3]
+        np.testing.assert_allclose(length[1], period - slip, atol=1e-10)
+        np.testing.assert_allclose(length.sum(), period, atol=1e-10)
+        np.testing.assert_allclose(path.y.v[1], v_dr, atol=1e-11)
+        np.testing.assert_allclose([path.y.x[2, -1], path.y.v[2, -1]], [o.y0.x, o.y0.v], atol=1e-10)
+        np.testing.assert_allclose(path.y.x[1:3, 0], path.y.x[:2, -1], atol=1e-10)
+
+
+def backward(v_dr, c):
+    system = gallery.StickSlip(c=c, v_dr=v_dr)
+    return find_orbit(system, Motion(1.0, -1.15 * v_dr), period=6.4, backward=True, throw=False, **METHOD)
+
+
+@pytest.mark.slow
+def test_derivative_of_backward_shooting():
+    jacobian = jax.jacfwd(lambda p: jnp.stack([backward(*p).period, backward(*p).events.y_before.x[1]]))(
+        jnp.array([0.5, 0.1])
+    )
+    lower, upper = (np.array(reference.infinitely_unstable_orbit(0.1 + d, 0.5)) for d in (-1e-6, 1e-6))
+    exact = (upper - lower) / 2e-6
+    _, x, _ = reference.infinitely_unstable_orbit(0.1, 0.5)
+    np.testing.assert_allclose(jacobian, [[0, exact[2]], [(x - 1) / 0.5, exact[1]]], atol=1e-8)
+
+
 def test_derivative_of_an_unstable_orbit():
     """Its period does not depend on v_dr, and x where it leaves the belt does so linearly: there is one scale."""
 
@@ -191,6 +236,7 @@ def test_wrong_segments(segments, message):
         (dict(method="shooting", pieces=2), "are for `method='segments'`"),
         (dict(symmetry="mirror"), "`symmetry` must be a function or 'inversion'"),
         (dict(symmetry="inversion", method="segments"), "`symmetry` is for `method='shooting'`"),
+        (dict(backward=True, pieces=2), "`backward` is for `method='shooting'`"),
         (dict(pieces=0), "`pieces` must be an integer from 1 to 64"),
     ],
 )
@@ -210,9 +256,10 @@ class Saddle(nsjax.System):
         return 2 * jnp.pi
 
 
-def test_violently_unstable():
-    """In pieces; the largest multiplier is 1.9e27, and no number of the monodromy matrix overflows."""
-    orbit = find_orbit(Saddle(), Motion(1.0, 0.0), pieces=20, **METHOD)
+@pytest.mark.parametrize("options", [dict(pieces=20), dict()])
+def test_violently_unstable(options):
+    """In pieces, which are tried too if nothing is said. The largest multiplier is 1.9e27, the smallest its reciprocal."""
+    orbit = find_orbit(Saddle(), Motion(1.0, 0.0), **options, **METHOD)
     np.testing.assert_allclose(orbit.y0, [-1 / 101, 0], atol=1e-12)
-    np.testing.assert_allclose(orbit.multipliers[0], np.exp(20 * np.pi), rtol=1e-8)
+    np.testing.assert_allclose(orbit.multipliers, np.exp([20 * np.pi, -20 * np.pi]), rtol=1e-8)
     assert not orbit.stable and orbit.admissible

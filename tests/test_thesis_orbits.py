@@ -99,3 +99,31 @@ def test_section_5_7(method):
         kinks = sorted(tuple(np.round([*e.y_after], 9)) for e in orbit.events)
         want = sorted(tuple(np.round(np.multiply(size, e[2:4]), 9)) for e in exact.events)
         np.testing.assert_allclose(kinks, want, atol=2e-9)
+
+
+@pytest.mark.slow
+def test_order_is_found_out():
+    """The subharmonic from nothing but a start: followed to where it settles, it repeats itself after two periods."""
+    shot = orbit_reference.impact_orbit("subharmonic")
+    orbit = find_orbit(Stop(**shot.parameters), Motion(0.0, 0.0), order=None, **METHOD)
+    np.testing.assert_allclose(orbit.period, shot.period, rtol=1e-14)
+    np.testing.assert_allclose(np.abs(orbit.multipliers), np.abs(shot.multipliers), atol=1e-8)
+
+
+def test_grazing():
+    """Pitfall 10: the linear orbit's amplitude is just the gap. By segments, with an impact of velocity zero, that is
+    well-posed: the Jacobian of the equations is regular, and only the monodromy matrix does not exist."""
+    c, omega = 0.1, 1.3
+    response = 1 / (1 - omega**2 + 1j * c * omega)
+    start, touch = 0.5, float(-np.angle(response) / omega) % (2 * np.pi / omega)
+    system = Stop(c=c, omega=omega, gap=abs(response))
+    free = {"stop": 0}
+    segments = [nsjax.Segment(free, touch - start + 0.05, ends="stop"), nsjax.Segment(free, 2.0)]
+    z = response * np.exp(1j * omega * start)
+    exact = [z.real, (1j * omega * z).real]
+    guess = Motion(exact[0] + 0.02, exact[1] - 0.03)
+    orbit = find_orbit(system, guess, t0=start, segments=segments, **METHOD)
+    np.testing.assert_allclose([orbit.y0.x, orbit.y0.v], exact, atol=1e-10)
+    np.testing.assert_allclose([orbit.events.t[0], orbit.events.y_before.v[0]], [touch, 0], atol=1e-9)
+    assert orbit.result == RESULTS.tangential_event and orbit.admissible
+    assert "met tangentially" in str(RESULTS[orbit.result])

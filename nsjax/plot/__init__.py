@@ -5,4 +5,5 @@ from ._matrix import fundamental_matrix as fundamental_matrix, multipliers as mu
 from ._path import components as components
 from ._phase import phase_portrait as phase_portrait, poincare_section as poincare_section
 from ._time import time_series as time_series
+from ._tube import perturbation_tube as perturbation_tube
 from ._work_precision import work_precision as work_precision

@@ -1,5 +1,6 @@
 """Linearised dynamics: the fundamental solution matrix against time, and Floquet multipliers."""
 
+from collections.abc import Sequence
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -65,38 +66,57 @@ def fundamental_matrix(
 def multipliers(orbit: Any, *, ax: "Axes | None" = None) -> "Axes":
     """Draws the Floquet multipliers of an orbit in the complex plane, with the unit circle.
 
-    The multiplier 1 which an autonomous system always has, that of a shift along the orbit, is drawn hollow.
+    The multiplier 1 which an autonomous system always has, that of a shift along the orbit, is drawn hollow. An infinite
+    one stands at the right edge. Of several orbits each has its own colour, the stable ones dots and the unstable ones
+    diamonds.
 
     **Arguments:**
 
-    - `orbit`: an `Orbit`.
+    - `orbit`: an `Orbit`, or a sequence of them, as from `find_orbits`.
     - `ax`: where to draw; by default a new figure.
 
     **Returns:** the axes.
+
+    **Raises:** `ValueError` for an orbit that was not found, or none at all.
     """
+    orbits = list(orbit) if isinstance(orbit, Sequence) else [orbit]
+    if not orbits:
+        raise ValueError("Argument `orbit` must be an orbit or a sequence of them, but is empty.")
+    if any(np.isnan(np.asarray(each.multipliers)).any() for each in orbits):
+        raise ValueError("Argument `orbit` must be an orbit that was found, but its multipliers are not numbers.")
     ax = axes_or_new(ax)
-    values = np.asarray(orbit.multipliers)
     angle = np.linspace(0, 2 * np.pi, 361)
     ax.plot(np.cos(angle), np.sin(angle), color="0.5", linewidth=1.0)
     ax.axhline(0, color="0.85", linewidth=0.8, zorder=0)
     ax.axvline(0, color="0.85", linewidth=0.8, zorder=0)
-    trivial = np.zeros(len(values), bool)
-    if orbit.system.period is None:
-        trivial[np.argmin(np.abs(values - 1))] = True
-    for those, fill, label in ((~trivial, "C3", "Floquet multipliers"), (trivial, "white", "along the orbit")):
-        if those.any():
-            shown = values[those]
-            ax.plot(
-                np.real(shown),
-                np.imag(shown),
-                "o",
-                markerfacecolor=fill,
-                markeredgecolor="C3",
-                label=label,
-                clip_on=False,
-            )
+    for i, each in enumerate(orbits):
+        if len(orbits) == 1:
+            _draw_multipliers(ax, each, "C3", "o", "Floquet multipliers")
+        else:
+            name, mark = ("stable", "o") if each.stable else ("unstable", "D")
+            _draw_multipliers(ax, each, f"C{i % 10}", mark, f"orbit {i + 1}, {name}")
     ax.set_aspect("equal")
     ax.set_xlabel("Re λ [-]")
     ax.set_ylabel("Im λ [-]")
     legend(ax)
     return ax
+
+
+def _draw_multipliers(ax: "Axes", orbit: Any, color: str, marker: str, label: str) -> None:
+    values = np.asarray(orbit.multipliers)
+    infinite = np.isinf(values)
+    trivial = np.zeros(len(values), bool)
+    if orbit.system.period is None:
+        trivial[np.argmin(np.where(infinite, np.inf, np.abs(np.where(infinite, 0, values) - 1)))] = True
+    style: dict[str, Any] = dict(linestyle="none", markeredgecolor=color, clip_on=False)
+    for those, fill, name in ((~trivial, color, label), (trivial, "white", "along the orbit")):
+        shown = values[those & ~infinite]
+        if len(shown):
+            ax.plot(np.real(shown), np.imag(shown), marker=marker, markerfacecolor=fill, label=name, **style)
+    if infinite.any():
+        # Its argument has no meaning: beside the positive real axis, whatever the limits.
+        edge = ax.get_yaxis_transform()
+        ax.plot([1.0], [0.0], transform=edge, marker=">", markersize=9, markerfacecolor=color, label=label, **style)
+        note = "∞" if infinite.sum() == 1 else f"∞ ({infinite.sum()} of them)"
+        ax.annotate(note, (1.0, 0.0), (8, 0), xycoords=edge, textcoords="offset points", va="center", color=color)
+        ax.margins(x=0.15)

@@ -1,18 +1,23 @@
 """What is drawn: a solution cut into smooth arcs at its events."""
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .._orbit import Orbit
 from .._solution import Events, Solution
+from .._solve import solve
 from .._types import Y
 
 
+DENSE = dfx.SaveAt(dense=True)
 SAMPLES = 32  # points drawn for each step of dense output: its polynomial may turn by a radian or two
 
 Values = dict[str, Float[np.ndarray, " times"]]
@@ -60,10 +65,40 @@ def chosen(values: Mapping[str, Any], names: list[str | None]) -> list[str]:
 
 def solved(of: Any) -> Solution:
     """A solution as it is, or one period of an orbit."""
-    sol = of if isinstance(of, Solution) else of.solve(saveat=dfx.SaveAt(dense=True))
+    if isinstance(of, Solution):
+        sol = of
+    else:
+        sol = of.solve(saveat=DENSE)
+        if isinstance(of, Orbit) and not _returns(of, sol):
+            sol = _arc_by_arc(of)
     if np.ndim(sol.t1):
         raise ValueError("Argument `sol` must be one solution, but it is a batch of them (from `jax.vmap`).")
     return sol
+
+
+def _returns(orbit: Orbit, sol: Solution) -> bool:
+    if np.ndim(sol.t1):
+        return True
+    gap = jax.tree.map(lambda a, b: np.max(np.abs(np.asarray(a - b)), initial=0.0), sol.y1, orbit.y0)
+    size = jax.tree.map(lambda a: 1 + np.max(np.abs(np.asarray(a)), initial=0.0), orbit.y0)
+    return all(a <= 1e-3 * b for a, b in zip(jax.tree.leaves(gap), jax.tree.leaves(size)))
+
+
+def _arc_by_arc(orbit: Orbit) -> Solution:
+    """An orbit that no solution of an initial value problem follows, as it leaves a surface that repels or is violently
+    unstable: from each of its events to the next."""
+    e, n = orbit.events, len(orbit.events)
+    times = [orbit.t0, *e.t[:n], orbit.t0 + orbit.period]
+    starts = [orbit.y0, *(jax.tree.map(lambda leaf, i=i: leaf[i], e.y_after) for i in range(n))]
+    modes = [orbit.mode, *e.mode_after[:n]]
+    sols = [
+        solve(orbit.system, *times[i : i + 2], starts[i], mode=tuple(modes[i]), saveat=DENSE, **dict(orbit.options))
+        for i in range(n + 1)
+    ]
+    pieces = [(jax.tree.map(lambda leaf, m=int(s.dense[4]): leaf[:m], s.dense[:3])) for s in sols]
+    joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *pieces)
+    dense = (*joined, sols[0].dense[3], sum(s.dense[4] for s in sols))
+    return dataclasses.replace(sols[-1], t0=orbit.t0, mode0=orbit.mode, events=e, dense=dense)
 
 
 def arcs(sol: Solution) -> list[Arc]:

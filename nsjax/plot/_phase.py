@@ -7,6 +7,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
+from .._orbit import Orbit
 from .._solution import Solution
 from .._structure import is_constant
 from .._system import AbstractSwitch, impact, relay, sgn
@@ -18,6 +19,7 @@ from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+DASHES = (0, (4, 1.5))  # in widths of the line
 GRID = 201  # points along each axis on which the indicator functions are drawn
 
 
@@ -36,7 +38,8 @@ def phase_portrait(
     """Draws a trajectory in the phase plane: coloured by mode, thick where it slides, with its events; Fig. 3.5.
 
     For a state of two components the surfaces h = 0 are drawn as lines with the signs of h beside them, the region
-    h < 0 lightly shaded, and hatched where an impact forbids it. (A surface that moves with time is left out.)
+    h < 0 lightly shaded, and hatched where an impact forbids it. (A surface that moves with time is left out.) An orbit
+    that is not stable is dashed.
 
     **Arguments:**
 
@@ -52,9 +55,13 @@ def phase_portrait(
 
     **Raises:** `ValueError` for an unknown component, a batch of solutions, or one without states along the way.
     """
+    unstable = isinstance(sol, Orbit) and not bool(jnp.all(sol.stable))
     sol = solved(sol)
     x, y = chosen(components(sol.y1), [x, y])
     ax = axes_or_new(ax)
+    if unstable:
+        style = dict(linestyle=DASHES) | style
+        ax.plot([], [], color="0.35", linestyle=style["linestyle"], label="unstable")
     for arc in arcs(sol):
         ax.plot(arc.y[x], arc.y[y], solid_capstyle="butt", **mode_line(sol.system, arc.mode) | style)
     if events:

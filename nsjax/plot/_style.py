@@ -45,9 +45,10 @@ def axis_label(labels: Labels, name: Any, default: str | None = None) -> str:
 
 
 def legend(ax: "Axes") -> None:
-    """A legend above the axes, where it hides nothing; each label once."""
+    """A legend above the axes, where it hides nothing; each label once, as it was drawn first."""
     handles, names = ax.get_legend_handles_labels()
-    unique = dict(zip(names, handles))
+    unique = dict(reversed([*zip(names, handles)]))
+    unique = {name: unique[name] for name in dict.fromkeys(names)}
     if unique:
         place = dict(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize="small", frameon=False)
         ax.legend(unique.values(), unique.keys(), **place)
