@@ -59,7 +59,7 @@ def find_orbit(
     result is moved away from events. The orbit's period, states and multipliers are differentiable with respect to the
     parameters of `system`, twice too, by implicit differentiation.
 
-    Where shooting does not converge from the guess, segments are tried, then segments in eight pieces, and then from
+    Where shooting does not converge from the guess, segments are tried, then segments in sixteen pieces, and then from
     where the solution settles: unless `method` says which it is to be. (This needs concrete values: under `jit` or
     `vmap` there is one try.)
 
@@ -147,7 +147,7 @@ def find_orbit(
         shoots = method != "segments" and pieces == 1
         orbit = search(y0, period, order, mode, None if shoots else pieces)
         if concrete and shoots and method is None and symmetry is None and not backward:
-            for more in (1, 8):
+            for more in (1, 16):
                 if orbit.result == RESULTS.orbit_not_found:
                     other = search(y0, period, order, mode, more)
                     orbit = other if is_okay(other.result) else orbit

@@ -8,7 +8,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ._filippov import Model
 from ._orbit import distance, ravel
@@ -75,9 +75,8 @@ def settle_down(
     How long that takes is measured in steps of the integration, which know the system's own scale of time.
     """
     if system.period is not None:
-        length = 100 * jnp.asarray(system.period, t0.dtype)
-        last = solve(system, t0, t0 + sign * length, y0, mode=mode, throw=False, **method)
-        return last.y1, length, jnp.zeros((), bool)
+        last, _ = _laps(system, t0, y0, sign, mode, method, 100)
+        return last, jnp.asarray(system.period, t0.dtype), jnp.zeros((), bool)
     # Only a guess is wanted: a loose tolerance makes long steps, and so the solution is followed farther.
     loose = 1e-6 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4
     controller = dfx.PIDController(rtol=loose, atol=loose)
@@ -103,17 +102,27 @@ def settle_down(
     return last.y1, jnp.where(rests, 0, sign * (times[jnp.argmax(low)] - t0)), rests
 
 
+def _laps(
+    system: System, t0: Scalar, y0: Y, sign: float, mode: Any, method: dict, number: int
+) -> tuple[Y, Float[Array, "laps n"]]:
+    """A solution of a forced system after so many periods, and its states after each: `method` is meant for one."""
+    end = t0 + sign * jnp.asarray(system.period, t0.dtype)
+
+    def lap(here: tuple, _: Any) -> tuple[tuple, Array]:
+        y, mode = here
+        sol = solve(system, t0, end, y, mode=mode if system.switches else None, throw=False, **method)
+        return (sol.y1, tuple(sol.mode1)), ravel(sol.y1)
+
+    first = solve(system, t0, end, y0, mode=mode, throw=False, **method)
+    (last, _), later = lax.scan(lap, (first.y1, tuple(first.mode1)), None, length=number - 1)
+    return last, jnp.concatenate([ravel(first.y1)[None], later])
+
+
 @eqx.filter_jit
 def repeats(system: System, t0: Scalar, y0: Y, sign: float, method: dict, most: int = 16) -> Int[Array, ""]:
     """After how many periods of the forcing a solution that has settled repeats itself."""
-    period = jnp.asarray(system.period, t0.dtype)
-
-    def lap(y: Y, _: Any) -> tuple[Y, Array]:
-        y = solve(system, t0, t0 + sign * period, y, throw=False, **method).y1
-        return y, ravel(y)
-
-    _, points = lax.scan(lap, y0, None, length=most)
+    _, points = _laps(system, t0, y0, sign, None, method, most)
     gaps = distance(points, ravel(y0))
-    # What is left of the way to where it settles is small beside how far the points lie apart, or all there is.
-    extent = 1e-9 * (1 + jnp.max(jnp.abs(points))) + 1e-2 * jnp.max(gaps)
+    # What is left of the way to where it settles is small beside the state, and beside how far the points lie apart.
+    extent = 1e-4 * jnp.max(jnp.abs(points)) + 1e-2 * jnp.max(gaps)
     return 1 + jnp.argmax(gaps <= jnp.maximum(extent, 2 * jnp.min(gaps)))

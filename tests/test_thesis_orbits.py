@@ -105,9 +105,13 @@ def test_section_5_7(method):
 def test_order_is_found_out():
     """The subharmonic from nothing but a start: followed to where it settles, it repeats itself after two periods."""
     shot = orbit_reference.impact_orbit("subharmonic")
-    orbit = find_orbit(Stop(**shot.parameters), Motion(0.0, 0.0), order=None, **METHOD)
+    orbit = find_orbit(Stop(**shot.parameters), Motion(-0.5, 0.0), order=None, **METHOD)
     np.testing.assert_allclose(orbit.period, shot.period, rtol=1e-14)
     np.testing.assert_allclose(np.abs(orbit.multipliers), np.abs(shot.multipliers), atol=1e-8)
+    # Another start leads, slowly, to the orbit without contact.
+    free = find_orbit(Stop(**shot.parameters), Motion(0.0, 0.0), order=None, **METHOD)
+    np.testing.assert_allclose(free.period, shot.period / 2, rtol=1e-14)
+    assert len(free.events) == 0
 
 
 def test_grazing():

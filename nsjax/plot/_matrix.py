@@ -6,6 +6,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from .._floquet import trivial
 from .._solution import Events
 from ._style import axes_or_new, axis_label, Labels, legend
 
@@ -66,9 +67,9 @@ def fundamental_matrix(
 def multipliers(orbit: Any, *, ax: "Axes | None" = None) -> "Axes":
     """Draws the Floquet multipliers of an orbit in the complex plane, with the unit circle.
 
-    The multiplier 1 which an autonomous system always has, that of a shift along the orbit, is drawn hollow. An infinite
-    one stands at the right edge. Of several orbits each has its own colour, the stable ones dots and the unstable ones
-    diamonds.
+    The multiplier 1 which an autonomous system always has, that of a shift along the orbit, is drawn hollow. An
+    infinite one stands at the right edge. Of several orbits each has its own colour, the stable ones dots and the
+    unstable ones diamonds.
 
     **Arguments:**
 
@@ -105,11 +106,9 @@ def multipliers(orbit: Any, *, ax: "Axes | None" = None) -> "Axes":
 def _draw_multipliers(ax: "Axes", orbit: Any, color: str, marker: str, label: str) -> None:
     values = np.asarray(orbit.multipliers)
     infinite = np.isinf(values)
-    trivial = np.zeros(len(values), bool)
-    if orbit.system.period is None:
-        trivial[np.argmin(np.where(infinite, np.inf, np.abs(np.where(infinite, 0, values) - 1)))] = True
+    along = np.asarray(trivial(values)) if orbit.system.period is None else np.zeros(len(values), bool)
     style: dict[str, Any] = dict(linestyle="none", markeredgecolor=color, clip_on=False)
-    for those, fill, name in ((~trivial, color, label), (trivial, "white", "along the orbit")):
+    for those, fill, name in ((~along, color, label), (along, "white", "along the orbit")):
         shown = values[those & ~infinite]
         if len(shown):
             ax.plot(np.real(shown), np.imag(shown), marker=marker, markerfacecolor=fill, label=name, **style)

@@ -7,13 +7,11 @@ from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from .._orbit import Orbit
 from .._solution import Events, Solution
-from .._solve import solve
 from .._types import Y
 
 
@@ -68,9 +66,9 @@ def solved(of: Any) -> Solution:
     if isinstance(of, Solution):
         sol = of
     else:
-        sol = of.solve(saveat=DENSE)
+        sol = of.solve(saveat=DENSE, throw=False) if isinstance(of, Orbit) else of.solve(saveat=DENSE)
         if isinstance(of, Orbit) and not _returns(of, sol):
-            sol = _arc_by_arc(of)
+            sol = _arc_by_arc(of, sol)
     if np.ndim(sol.t1):
         raise ValueError("Argument `sol` must be one solution, but it is a batch of them (from `jax.vmap`).")
     return sol
@@ -84,21 +82,15 @@ def _returns(orbit: Orbit, sol: Solution) -> bool:
     return all(a <= 1e-3 * b for a, b in zip(jax.tree.leaves(gap), jax.tree.leaves(size)))
 
 
-def _arc_by_arc(orbit: Orbit) -> Solution:
-    """An orbit that no solution of an initial value problem follows, as it leaves a surface that repels or is violently
-    unstable: from each of its events to the next."""
-    e, n = orbit.events, len(orbit.events)
-    times = [orbit.t0, *e.t[:n], orbit.t0 + orbit.period]
-    starts = [orbit.y0, *(jax.tree.map(lambda leaf, i=i: leaf[i], e.y_after) for i in range(n))]
-    modes = [orbit.mode, *e.mode_after[:n]]
-    sols = [
-        solve(orbit.system, *times[i : i + 2], starts[i], mode=tuple(modes[i]), saveat=DENSE, **dict(orbit.options))
-        for i in range(n + 1)
-    ]
-    pieces = [(jax.tree.map(lambda leaf, m=int(s.dense[4]): leaf[:m], s.dense[:3])) for s in sols]
-    joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *pieces)
-    dense = (*joined, sols[0].dense[3], sum(s.dense[4] for s in sols))
-    return dataclasses.replace(sols[-1], t0=orbit.t0, mode0=orbit.mode, events=e, dense=dense)
+def _arc_by_arc(orbit: Orbit, sol: Solution) -> Solution:
+    """An orbit that its solution `sol` leaves, as a surface repels or it is violently unstable: along its own arcs."""
+    path = orbit.path(SAMPLES * 4)
+    rows = np.flatnonzero(np.asarray(path.t[:, -1] != path.t[:, 0]))
+    order = rows[np.argsort(np.asarray(path.t[rows, 0]))]
+    ts, ys = jax.tree.map(lambda leaf: leaf[order].reshape(-1, *leaf.shape[2:]), (path.t, path.y))
+    return dataclasses.replace(
+        sol, t1=orbit.t0 + orbit.period, y1=orbit.y0, mode1=orbit.mode, ts=ts, ys=ys, events=orbit.events, dense=None
+    )
 
 
 def arcs(sol: Solution) -> list[Arc]:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from .._orbit import Orbit
 from .._variational import fundamental_matrix
-from ._path import Arc, arcs, chosen, components, solved
+from ._path import Arc, arcs, chosen, components
 from ._phase import phase_portrait
 from ._style import axes_or_new, Labels, legend as add_legend, mode_line
 
@@ -55,8 +55,8 @@ def perturbation_tube(
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` for an unknown component, a radius that is not positive, or an orbit without Φ: one that was
-    not found, or leaves a surface that repels.
+    **Raises:** `ValueError` for an unknown component, a radius that is not positive, or an orbit without Φ: one that
+    was not found, or leaves a surface that repels.
     """
     from matplotlib.collections import PolyCollection
 
@@ -72,7 +72,7 @@ def perturbation_tube(
             raise ValueError(f"Argument `{name}` must be a positive integer, but got {count!r}.")
     names = list(components(orbit.y0))
     x, y = chosen(components(orbit.y0), [x, y])
-    sol = solved(orbit)
+    sol = orbit.solve()
     pieces = arcs(sol)
     extent = np.array([np.ptp(np.concatenate([arc.y[name] for arc in pieces])) for name in (x, y)])
     extent = np.where(extent > 0, extent, 1.0)
