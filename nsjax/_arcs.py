@@ -102,11 +102,16 @@ class Flows(eqx.Module):
         ts, xs = self.rows(along, begin, end, x)
         return ts.reshape(len(begin), -1), xs.reshape(len(begin), -1, x.shape[-1])
 
-    def derivatives(self, begin: Array, end: Array, x: Array) -> Float[Array, "rows pieces n n"]:
-        """Of the end of every piece by its beginning."""
+    def derivatives(self, begin: Array, end: Array, x: Array) -> tuple[Array, Float[Array, "rows pieces n n"]]:
+        """The ends of all pieces, and their derivatives by the beginnings."""
 
-        def one(a: Scalar, b: Scalar, x: Array, state: State) -> Array:
-            return jax.jacfwd(lambda x: self.piece(a, b, x, state, dfx.SaveAt(t1=True))[0])(x)
+        def one(a: Scalar, b: Scalar, x: Array, state: State) -> tuple[Array, Array]:
+            def last(x: Array) -> tuple[Array, Array]:
+                (end,) = self.piece(a, b, x, state, dfx.SaveAt(t1=True))
+                return end, end
+
+            phi, end = jax.jacfwd(last, has_aux=True)(x)
+            return end, phi
 
         return self.rows(one, begin, end, x)
 

@@ -7,20 +7,19 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.core
-import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 
 from ._check import check_solve
-from ._cuts import cuts_from, cuts_near, Segment
-from ._guess import repeats, settle_down
+from ._cuts import Segment
+from ._forward import forward_only
+from ._jacobian import dense_jacobian
 from ._orbit import Orbit, ravel
-from ._segments import by_segments
-from ._shooting import shoot
-from ._solution import is_okay, raise_if, RESULTS
+from ._search import Search
+from ._solution import is_okay, raise_if
 from ._sweep import sweep
-from ._system import arrays_of, frozen, System
-from ._types import Scalar, Y
+from ._system import arrays_of, System
+from ._types import Y
 
 
 def _inversion(y: Y) -> Y:
@@ -46,6 +45,7 @@ def find_orbit(
     max_iterations: int = 30,
     max_steps: int = 4096,
     max_events: int = 64,
+    adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
     throw: bool = True,
 ) -> Orbit:
     """Finds a periodic orbit by optimistix's Newton method, in one of two formulations.
@@ -86,7 +86,11 @@ def find_orbit(
     - `solver`, `stepsize_controller`, `max_steps`, `max_events`: as for `solve`; by default Dopri8 with tolerances of
         1e-12 (float32: 1e-6).
     - `tol`: tolerance of Newton's method, by default 1e-10 (float32: 1e-4).
-    - `throw`: whether a failure raises; if not, look at `Orbit.result`.
+    - `adjoint`: `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`; for `jax.grad` and `jax.linearize` (and so for
+        optimistix's optimisers) `diffrax.DirectAdjoint()`, at the cost of a forward derivative for each parameter that
+        is perturbed.
+    - `throw`: whether a failure raises; if not, look at `Orbit.result`. Derivatives are not numbers where there is no
+        orbit.
 
     **Returns:** an `Orbit`. Its result is `RESULTS.tangential_event`, which is no failure, if it grazes a surface: the
     orbit is right, but its multipliers are not defined.
@@ -125,58 +129,25 @@ def find_orbit(
         raise ValueError("Argument `period` must not be given for a forced system; use `order` for a subharmonic.")
     if autonomous and order not in (1, None):
         raise ValueError("Argument `order` must be 1 for an autonomous system; pass the longer `period` instead.")
+    if not isinstance(adjoint, dfx.ForwardMode | dfx.DirectAdjoint):
+        raise ValueError(
+            "Argument `adjoint` must be `diffrax.ForwardMode()` or `diffrax.DirectAdjoint()`, but got "
+            f"{type(adjoint).__name__}."
+        )
     concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, y0, period)))
     if order is None and not autonomous and not concrete:
         raise ValueError("Argument `order` must be given under `jit` and `vmap`: finding it out needs concrete values.")
-    newton = dict(how=how, tol=tol, max_iterations=max_iterations)
-    sign = -1.0 if backward else 1.0
-
-    def search(y0: Y, period: Scalar, order: int, mode: Any, pieces: int | None) -> Orbit:
-        """By shooting, or by segments in so many pieces."""
-        if pieces is None:
-            return shoot(system, t0, y0, period, order, symmetry, backward, mode, **newton)
-        cuts, closes = cuts_near(frozen(system), t0, lax.stop_gradient(y0), period, order, mode, how)
-        if concrete:  # without the rows that are only there to fill up
-            cuts = cuts.first(int(cuts.num) + 1)
-        orbit = by_segments(system, cuts, t0, order, pieces, **newton)
-        result = RESULTS.where(closes, orbit.result, RESULTS.orbit_not_found)
-        return eqx.tree_at(lambda o: o.result, orbit, result)
-
-    def tries(y0: Y, period: Scalar, order: int, mode: Any) -> Orbit:
-        """In the ways that may be tried, until one finds it."""
-        shoots = method != "segments" and pieces == 1
-        orbit = search(y0, period, order, mode, None if shoots else pieces)
-        if concrete and shoots and method is None and symmetry is None and not backward:
-            for more in (1, 16):
-                if orbit.result == RESULTS.orbit_not_found:
-                    other = search(y0, period, order, mode, more)
-                    orbit = other if is_okay(other.result) else orbit
-        return orbit
-
-    if segments is not None:
-        cuts = cuts_from(frozen(system), segments, t0, lax.stop_gradient(y0), how)
-        orbit = by_segments(system, cuts, t0, order or 1, pieces, **newton)
-    elif autonomous and period is None:
-        start, period, rests = settle_down(frozen(system), t0, lax.stop_gradient(y0), sign, given, how)
-        lost = ~(period > 0)
-        orbit = tries(start, jnp.where(lost, 1, period), 1, None)
-        end = RESULTS.where(rests, RESULTS.orbit_is_equilibrium, RESULTS.orbit_not_found)
-        orbit = eqx.tree_at(lambda o: o.result, orbit, RESULTS.where(lost, end, orbit.result))
-    elif order is None:
-        start, _, _ = settle_down(system, t0, y0, sign, given, how)
-        orbit = tries(start, jnp.ones_like(t0), int(repeats(system, t0, start, sign, how)), None)
+    newton = dict(tol=tol, max_iterations=max_iterations)
+    search = Search(t0, order, given, method, symmetry, backward, segments, pieces, concrete, how, newton)
+    if isinstance(adjoint, dfx.DirectAdjoint) and not concrete:
+        orbit = dense_jacobian(search.run, system, y0, period)
     else:
-        period = jnp.asarray(1.0 if period is None else period, t0.dtype)
-        if concrete and not period > 0:
-            raise ValueError(f"Argument `period` must be positive, but got {period}.")
-        orbit = tries(y0, period, order, given)
-        if concrete and not bool(is_okay(orbit.result) | (orbit.result == RESULTS.orbit_is_multiple_cover)):
-            y1, period, rests = settle_down(system, t0, y0, sign, given, how)
-            if rests:
-                orbit = eqx.tree_at(lambda o: o.result, orbit, RESULTS.orbit_is_equilibrium)
-            if period > 0:
-                second = tries(y1, period, order, None)
-                orbit = second if bool(is_okay(second.result)) else orbit
+        system = forward_only(
+            system,
+            "`nsjax.find_orbit` was linearised or differentiated in reverse mode (`jax.grad`, `jax.vjp`, "
+            "`jax.linearize`), which needs `adjoint=diffrax.DirectAdjoint()`. Or use `jax.jacfwd`.",
+        )
+        orbit = search.run(system, y0, period)
     if throw:
         orbit = raise_if(~is_okay(orbit.result), orbit.result, orbit)
     return orbit

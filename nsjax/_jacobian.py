@@ -47,4 +47,4 @@ def _call_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     kept: list[Any] = []
     # Leaf by leaf: the Jacobian of a result that nobody uses is never computed.
     matrices, (smooth, arrays) = jax.jacfwd(flat, has_aux=True)(x)
-    return eqx.combine(smooth, arrays, kept[0]), jax.tree.map(lambda m: jnp.dot(m, dx), matrices)
+    return eqx.combine(smooth, arrays, kept[0]), jax.tree.map(lambda m: jnp.dot(m, dx.astype(m.dtype)), matrices)

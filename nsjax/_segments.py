@@ -11,14 +11,14 @@ import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
-import optimistix as optx
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from ._arcs import Arcs, Flows, model_of, SAMPLES
 from ._cuts import Cuts, landing, where
 from ._event import cosine
 from ._filippov import Model, State
 from ._floquet import floquet, forwards, structural_zeros
+from ._implicit import find_root
 from ._orbit import fractions, judge, Orbit, ravel
 from ._saltation import fired, saltation_matrices
 from ._solution import Events, is_okay, RESULTS
@@ -41,108 +41,136 @@ def _tangency(model: Model, k: Array, t: Scalar, y: Y, state: State) -> Scalar:
     return out
 
 
-@eqx.filter_jit
-def by_segments(
-    system: System, cuts: Cuts, t0: Scalar, order: int, pieces: int, how: dict, tol: float, max_iterations: int
-) -> Orbit:
-    """Newton's method on the equations of all segments.
+class _Cycle(eqx.Module):
+    """The equations of all segments of an orbit.
 
-    The unknowns of a segment are its times of beginning and end, and its state at the beginning (with `pieces`, also
-    the states in between). Equations: the states at the cuts, what ends the segment, and when it begins.
+    The unknowns of a segment are its times of beginning and end, and its states at the beginning of each of its pieces.
     """
-    autonomous = system.period is None
-    y0 = jax.tree.map(lambda x: x[0], cuts.y)
-    x0, unravel = jfu.ravel_pytree(lax.stop_gradient(y0))
-    index = jnp.arange(len(cuts.begin), dtype=cuts.num.dtype)
-    happened, repels = index < cuts.num, jnp.asarray(cuts.free)
-    following = tuple(jnp.where(happened, jnp.roll(m, -1), m) for m in cuts.within.mode)
 
-    def flows(system: System) -> Flows:
-        return Flows(system, cuts.within, t0, y0, pieces, tuple(how.items()))
+    cuts: Cuts
+    t0: Scalar
+    y0: Y
+    order: int = eqx.field(static=True)
+    pieces: int = eqx.field(static=True)
+    how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
 
-    def conditions(system: System, begin: Array, end: Array, first: Array, last: Array) -> tuple[Array, Array]:
-        model = model_of(system, t0, y0)
-        at_end = jax.vmap(lambda k, t, x, s: _guard(model, k, t, unravel(x), s))(cuts.switch, end, last, cuts.ending)
+    @property
+    def index(self) -> Int[Array, " rows"]:
+        return jnp.arange(len(self.cuts.begin), dtype=self.cuts.num.dtype)
+
+    @property
+    def happened(self) -> Bool[Array, " rows"]:
+        """Which segments end with an event."""
+        return self.index < self.cuts.num
+
+    @property
+    def following(self) -> tuple[Array, ...]:
+        return tuple(jnp.where(self.happened, jnp.roll(m, -1), m) for m in self.cuts.within.mode)
+
+    def unravel(self, x: Array) -> Y:
+        return jfu.ravel_pytree(self.y0)[1](x)
+
+    def flows(self, system: System, pieces: int | None = None) -> Flows:
+        return Flows(system, self.cuts.within, self.t0, self.y0, pieces or self.pieces, self.how)
+
+    def conditions(self, system: System, begin: Array, end: Array, first: Array, last: Array) -> tuple[Array, Array]:
+        """What vanishes at the end of every segment, and what does at the beginning of those that are free."""
+        model, cuts = model_of(system, self.t0, self.y0), self.cuts
+        at_end = jax.vmap(lambda k, t, x, s: _guard(model, k, t, self.unravel(x), s))
+        at_end = at_end(cuts.switch, end, last, cuts.ending)
         if not any(cuts.free):
             return at_end, at_end
-        at_begin = jax.vmap(lambda k, t, x, s: _tangency(model, k, t, unravel(x), s))
+        at_begin = jax.vmap(lambda k, t, x, s: _tangency(model, k, t, self.unravel(x), s))
         return at_end, at_begin(cuts.switch, begin, first, cuts.within)
 
-    def jumps(system: System, end: Array, last: Array) -> tuple[Array, Array]:
-        model = model_of(system, t0, y0)
+    def jumps(self, system: System, end: Array, last: Array) -> tuple[Array, Array]:
+        """The states after the events, and the times up to where impacts have come to rest."""
+        model = model_of(system, self.t0, self.y0)
 
         def row(k: Array, t: Scalar, x: Array, ending: State, after: tuple) -> tuple[Array, Scalar]:
-            y, rest = landing(model, k, t, unravel(x), ending, after)
+            y, rest = landing(model, k, t, self.unravel(x), ending, after)
             return ravel(y), rest
 
-        return jax.vmap(row)(cuts.switch, end, last, cuts.ending, following)
+        return jax.vmap(row)(self.cuts.switch, end, last, self.cuts.ending, self.following)
 
-    # A first look: the states between the pieces, and how fast the conditions change (divided by that they are times,
-    # whatever the units of h).
-    still = frozen(system)
-    begin, end, y = lax.stop_gradient((cuts.begin, cuts.end, cuts.y))
-    first = jax.vmap(ravel)(y)
-    whole = Flows(still, cuts.within, t0, y0, 1, tuple(how.items()))
-    ts, xs = whole.paths(begin, end, first[:, None])
-    x = xs[:, :: SAMPLES // pieces][:, :pieces] if pieces > 1 else first[:, None]
-    field = jax.vmap(lambda t, x, s: ravel(model_of(still, t0, y0).flow(t, unravel(x), s)))
-    last = xs[:, -1]
-    now = (begin, end, first, last)
-    moves = (jnp.ones_like(begin), jnp.ones_like(end), field(begin, first, cuts.within), field(end, last, cuts.ending))
-    _, rates = jax.jvp(lambda *a: conditions(still, *a), now, moves)
-    rates = jax.tree.map(lambda r: lax.stop_gradient(jnp.where((r == 0) | ~jnp.isfinite(r), 1, r)), rates)
-    normal = lax.stop_gradient(moves[2][0])
-    normal = normal / jnp.where(normal @ normal == 0, 1, normal @ normal)
+    def first_look(self, system: System) -> tuple[tuple, tuple, Array]:
+        """A guess of the unknowns; how fast the conditions change there (divided by that they are times, whatever the
+        units of h); and the normal of the section on which an autonomous orbit begins."""
+        cuts = self.cuts
+        begin, end, first = cuts.begin, cuts.end, jax.vmap(ravel)(cuts.y)
+        _, xs = self.flows(system, 1).paths(begin, end, first[:, None])
+        x = xs[:, :: SAMPLES // self.pieces][:, : self.pieces] if self.pieces > 1 else first[:, None]
+        model = model_of(system, self.t0, self.y0)
+        field = jax.vmap(lambda t, x, s: ravel(model.flow(t, self.unravel(x), s)))
+        now = (begin, end, first, xs[:, -1])
+        one = jnp.ones_like(begin)
+        moves = (one, one, field(begin, first, cuts.within), field(end, xs[:, -1], cuts.ending))
+        _, rates = jax.jvp(lambda *a: self.conditions(system, *a), now, moves)
+        rates = jax.tree.map(lambda r: jnp.where((r == 0) | ~jnp.isfinite(r), 1, r), rates)
+        normal = moves[2][0]
+        return (begin, end, x), rates, normal / jnp.where(normal @ normal == 0, 1, normal @ normal)
 
-    def residual(z: tuple, system: System) -> tuple:
+    def residual(self, z: tuple, system: System, rates: tuple, normal: Array) -> tuple:
+        """The states at the cuts, what ends each segment (or begins it), and when it begins."""
         begin, end, x = z
-        ends = flows(system).ends(begin, end, x)
+        ends = self.flows(system).ends(begin, end, x)
         last = ends[:, -1]
-        after, rest = jumps(system, end, last)
-        at_end, at_begin = conditions(system, begin, end, x[:, 0], last)
-        ended = jnp.where(repels, at_begin / rates[1], at_end / rates[0])
-        if autonomous:
-            closing = jnp.broadcast_to(normal @ (x[0, 0] - x0), end.shape)
+        after, rest = self.jumps(system, end, last)
+        at_end, at_begin = self.conditions(system, begin, end, x[:, 0], last)
+        ended = jnp.where(jnp.asarray(self.cuts.free), at_begin / rates[1], at_end / rates[0])
+        if system.period is None:
+            closing = jnp.broadcast_to(normal @ (x[0, 0] - ravel(self.y0)), end.shape)
         else:
-            closing = end - t0 - order * jnp.asarray(system.period, t0.dtype)
-        ended = jnp.where(happened, ended, jnp.where(index == cuts.num, closing, end - begin))
+            closing = end - self.t0 - self.order * jnp.asarray(system.period, end.dtype)
+        ended = jnp.where(self.happened, ended, jnp.where(self.index == self.cuts.num, closing, end - begin))
         return (
             x[:, 0] - jnp.roll(after, 1, axis=0),
             x[:, 1:] - ends[:, :-1],
             ended,
-            begin - jnp.append(t0, (end + rest)[:-1]),
+            begin - jnp.append(self.t0, (end + rest)[:-1]),
         )
 
-    found = optx.root_find(
-        residual, optx.Newton(rtol=tol, atol=tol), (begin, end, x), args=system, max_steps=max_iterations, throw=False
-    )
-    begin, end, x = found.value
-    error = jnp.max(jnp.abs(jnp.concatenate([r.ravel() for r in residual(found.value, still)])))
+
+@eqx.filter_jit
+def by_segments(
+    system: System, cuts: Cuts, t0: Scalar, order: int, pieces: int, how: dict, tol: float, max_iterations: int
+) -> Orbit:
+    """Newton's method on the equations of all segments, and what is said of the orbit."""
+    autonomous = system.period is None
+    still = frozen(system)
+    cuts = frozen(cuts)
+    y0 = jax.tree.map(lambda x: x[0], cuts.y)
+    cycle = _Cycle(cuts, t0, y0, order, pieces, tuple(how.items()))
+    guess, rates, normal = cycle.first_look(still)
+
+    def residual(z: tuple, system: System) -> tuple:
+        return cycle.residual(z, system, rates, normal)
+
+    z, converged = find_root(residual, guess, system, tol, max_iterations)
+    begin, end, x = z
+    error = jnp.max(jnp.abs(jnp.concatenate([r.ravel() for r in residual(frozen(z), still)])))
     size = 1 + jnp.max(jnp.abs(x))
-    good = (found.result == optx.RESULTS.successful) & (error <= 1e3 * tol * size)
+    good = converged & (error <= 1e3 * tol * size)
     period = end[-1] - t0 if autonomous else jnp.asarray(system.period, t0.dtype) * order
     _, shares = fractions(autonomous, order)
-    later = flows(still).at(
-        t0 + lax.stop_gradient(period) * jnp.asarray(shares, t0.dtype), *lax.stop_gradient((begin, end, x))
-    )
+    here = lax.stop_gradient((begin, end, x))
+    later = cycle.flows(still).at(t0 + lax.stop_gradient(period) * jnp.asarray(shares, t0.dtype), *here)
     result = judge(good, x[0, 0], later, autonomous, order)
 
-    ts, xs = flows(still).paths(*lax.stop_gradient((begin, end, x)))
-    last = flows(system).ends(begin, end, x)[:, -1]
-    phi = flows(system).derivatives(begin, end, x)
-    events = _log(system, cuts, following, end, last, jumps(system, end, last), unravel)
-    monodromy, multipliers, stable, zeros = _floquet(system, cuts, events, happened, phi, autonomous)
+    ends, phi = cycle.flows(system).derivatives(begin, end, x)
+    events = _log(system, cycle, end, ends[:, -1])
+    monodromy, multipliers, stable, zeros = _floquet(system, cycle, events, phi)
     # Where a free segment begins it is tangential that it must be.
-    meant = jnp.roll(repels, -1)
-    grazes = jnp.any(happened & ~meant & (events.transversality < jnp.cbrt(jnp.finfo(end.dtype).eps)))
-    violation, violation_t = _violation(model_of(still, t0, y0), cuts, ts, xs, unravel)
+    meant = jnp.roll(jnp.asarray(cuts.free), -1)
+    grazes = jnp.any(cycle.happened & ~meant & (events.transversality < jnp.cbrt(jnp.finfo(end.dtype).eps)))
+    violation, violation_t = _violation(still, cycle, *cycle.flows(still).paths(*here))
     admissible = (violation == 0) & jnp.all(end - begin >= -1e3 * tol * (1 + jnp.abs(period)))
     result = RESULTS.where((result == RESULTS.successful) & grazes, RESULTS.tangential_event, result)
     result = RESULTS.where(is_okay(result) & ~admissible, RESULTS.orbit_not_admissible, result)
     return Orbit(
         system=system,
         t0=t0,
-        y0=unravel(x[0, 0]),
+        y0=cycle.unravel(x[0, 0]),
         mode=_modes(cuts.within.mode, begin)[0],
         period=period,
         events=events,
@@ -155,7 +183,7 @@ def by_segments(
         violation=violation,
         violation_t=violation_t,
         result=result,
-        arcs=Arcs(begin, end, _modes(cuts.within.mode, begin), jax.vmap(jax.vmap(unravel))(x)),
+        arcs=Arcs(begin, end, _modes(cuts.within.mode, begin), jax.vmap(jax.vmap(cycle.unravel))(x)),
         options=tuple(how.items()),
     )
 
@@ -164,12 +192,10 @@ def _modes(mode: tuple[Array, ...], rows: Array) -> Int[Array, "rows switches"]:
     return jnp.stack(mode, axis=1) if mode else jnp.zeros((len(rows), 0), jnp.int32)
 
 
-def _log(
-    system: System, cuts: Cuts, following: tuple, end: Array, last: Array, jump: tuple[Array, Array], unravel: Any
-) -> Events:
+def _log(system: System, cycle: _Cycle, end: Array, last: Array) -> Events:
     """The events between the segments."""
-    after, rest = jump
-    happened = jnp.arange(len(end), dtype=cuts.num.dtype) < cuts.num
+    cuts, happened, following, unravel = cycle.cuts, cycle.happened, cycle.following, cycle.unravel
+    after, rest = cycle.jumps(system, end, last)
     model = model_of(system, end[0], unravel(last[0]))
 
     def square(k: Array, t: Scalar, x: Array, s: State) -> Scalar:
@@ -191,10 +217,9 @@ def _log(
     return Events(**where(happened, columns, empty), num=cuts.num, names=names)
 
 
-def _floquet(
-    system: System, cuts: Cuts, events: Events, happened: Array, phi: Array, autonomous: bool
-) -> tuple[Array, Array, Array, Array]:
+def _floquet(system: System, cycle: _Cycle, events: Events, phi: Array) -> tuple[Array, Array, Array, Array]:
     """Monodromy matrix, multipliers, stability and structural zeros, from the derivatives along the segments."""
+    cuts, happened, autonomous = cycle.cuts, cycle.happened, system.period is None
     eye = jnp.eye(phi.shape[-1], dtype=phi.dtype)
     none = jnp.broadcast_to(eye, (len(phi), *eye.shape))
     zeros = structural_zeros(system, _modes(cuts.within.mode, happened))
@@ -220,15 +245,16 @@ def _floquet(
     return *forwards(floquet(factors[::-1], infinite, autonomous), infinite, autonomous), zeros
 
 
-def _violation(model: Model, cuts: Cuts, ts: Array, xs: Array, unravel: Any) -> tuple[Scalar, Scalar]:
+def _violation(system: System, cycle: _Cycle, ts: Array, xs: Array) -> tuple[Scalar, Scalar]:
     """By how much the guards of the modes are violated, and when: beyond what the tolerance makes of them."""
+    model, cuts = model_of(system, cycle.t0, cycle.y0), cycle.cuts
     if not model.slots:
         return jnp.zeros_like(ts[0, 0]), ts[0, 0]
 
     def row(ts: Array, xs: Array, within: State, ending: State) -> Array:
         def guards(t: Scalar, x: Array) -> Array:
             def by(state: State) -> Array:
-                return jnp.max(model.stacked(model.guards(t, unravel(x), state), -jnp.inf), axis=-1)
+                return jnp.max(model.stacked(model.guards(t, cycle.unravel(x), state), -jnp.inf), axis=-1)
 
             return jnp.maximum(by(within), by(ending))
 

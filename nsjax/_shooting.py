@@ -9,14 +9,13 @@ import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array
 
 from ._arcs import Arcs
 from ._filippov import Model
 from ._floquet import floquet, forwards, structural_zeros
 from ._guess import at_start, base_point
-from ._jacobian import dense_jacobian
+from ._implicit import find_root
 from ._orbit import distance, fractions, judge, Orbit, ravel
 from ._solution import Events, is_okay, RESULTS
 from ._solve import solve
@@ -87,17 +86,10 @@ def shoot(
 
         unknown = (flat,)
         at_rest = jnp.zeros((), bool)
-    found = optx.root_find(
-        lambda z, system: dense_jacobian(residual, z, system),
-        optx.Newton(rtol=tol, atol=tol),
-        unknown,
-        args=system,
-        max_steps=max_iterations,
-        throw=False,
-    )
-    x = found.value[0]
+    z, converged = find_root(residual, unknown, system, tol, max_iterations)
+    x = z[0]
     if autonomous:
-        period = jnp.exp(found.value[1])
+        period = jnp.exp(z[1])
     else:
         assert forcing is not None
         period = forcing
@@ -111,7 +103,7 @@ def shoot(
     points = jax.vmap(ravel)(sol.ys)
     error = distance(points[-1], x)
     size = 1 + jnp.max(jnp.abs(x))
-    good = (found.result == optx.RESULTS.successful) & (error <= 1e3 * tol * size) & is_okay(sol.result)
+    good = converged & (error <= 1e3 * tol * size) & is_okay(sol.result)
     result = judge(good, x, points[:-1], autonomous, order)
     if autonomous:
         # Where Newton's method ends near an equilibrium, its Jacobian is singular and it seldom says that it converged.

@@ -255,6 +255,40 @@ def test_forced_orbit_and_its_derivative():
     np.testing.assert_allclose(derivative, jnp.stack(jax.jacfwd(exact, (0, 1, 2))(*p), -1), atol=1e-8)
 
 
+def test_reverse_mode():
+    """With `DirectAdjoint`, as `jax.grad` and optimisers need it; without it is refused, by name."""
+
+    def amplitude(p, adjoint):
+        options = METHOD | dict(stepsize_controller=pid(1e-11))
+        o = find_orbit(Resonator(c=p[0], omega=p[1]), Motion(0.0, 0.0), throw=False, adjoint=adjoint, **options)
+        return jnp.hypot(o.y0.x, o.y0.v / p[1])
+
+    def exact(p):
+        return 1 / jnp.hypot(1 - p[1] ** 2, p[0] * p[1])
+
+    p = jnp.asarray([0.2, 0.7])
+    found = jax.jit(jax.grad(lambda p: amplitude(p, dfx.DirectAdjoint())))(p)
+    np.testing.assert_allclose(found, jax.grad(exact)(p), rtol=1e-8)
+    with pytest.raises(TypeError, match="`nsjax.find_orbit` was linearised .* needs `adjoint=diffrax.DirectAdjoint"):
+        jax.grad(lambda p: amplitude(p, dfx.ForwardMode()))(p)
+    with pytest.raises(ValueError, match="`adjoint` must be `diffrax.ForwardMode"):
+        amplitude(p, dfx.RecursiveCheckpointAdjoint())
+
+
+def test_derivative_where_there_is_no_orbit():
+    """Pitfall 17: one lane of a batch has none, and there the derivative is not a number."""
+
+    def period(w):
+        drift = jnp.where(w == 0, 1.0, 0.0)
+        o = find_orbit(Hopf(w=w, rate=1 - drift, drift=drift), Plane(0.9, 0.1), period=3.0, throw=False, **METHOD)
+        return o.period, o.result
+
+    derivative, result = jax.jit(jax.vmap(jax.jacfwd(period, has_aux=True)))(jnp.asarray([2.0, 0.0, 2.2]))
+    assert list(result == RESULTS.successful) == [True, False, True]
+    np.testing.assert_allclose(derivative[::2], -2 * np.pi / np.array([2.0, 2.2]) ** 2, rtol=1e-9)
+    assert np.isnan(derivative[1])
+
+
 @pytest.mark.slow
 def test_derivative_of_the_stick_slip_period():
     """T = 2 / v + π + 2 atan v."""
@@ -265,6 +299,33 @@ def test_derivative_of_the_stick_slip_period():
     for v in (0.2, 0.3):
         found = jax.jit(jax.jacfwd(period))(jnp.asarray(v))
         np.testing.assert_allclose(found, -2 / v**2 + 2 / (1 + v**2), rtol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["shooting", "segments"])
+def test_second_derivative_of_the_stick_slip_period(method):
+    """T'' = 4 / v³ - 4 v / (1 + v²)²; pitfall 20."""
+    options = METHOD | dict(stepsize_controller=pid(1e-12), max_steps=1024, max_events=4, method=method)
+
+    def period(v):
+        return find_orbit(gallery.StickSlip(v_dr=v), Motion(2.02, 0.0), period=13.54, throw=False, **options).period
+
+    v = 0.2
+    found = jax.jit(jax.jacfwd(jax.jacfwd(period)))(jnp.asarray(v))
+    np.testing.assert_allclose(found, 4 / v**3 - 4 * v / (1 + v**2) ** 2, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_second_derivative_of_a_multiplier():
+    """exp(-4 π μ / w); jax's own rule for eigenvalues has no second derivative."""
+
+    def small(p):
+        orbit = find_orbit(Hopf(mu=p[0], w=p[1]), Plane(0.9, 0.1), period=3.0, throw=False, **METHOD)
+        return jnp.min(jnp.abs(orbit.multipliers))
+
+    p = jnp.asarray([0.5, 2.0])
+    exact = jax.hessian(lambda p: jnp.exp(-4 * jnp.pi * p[0] / p[1]))(p)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(small)))(p), exact, rtol=1e-7)
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """The orbits of chapters 5 and 6, stable and unstable, from plausible guesses, against 40-digit references."""
 
 import diffrax as dfx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import orbit_reference
@@ -99,6 +100,36 @@ def test_section_5_7(method):
         kinks = sorted(tuple(np.round([*e.y_after], 9)) for e in orbit.events)
         want = sorted(tuple(np.round(np.multiply(size, e[2:4]), 9)) for e in exact.events)
         np.testing.assert_allclose(kinks, want, atol=2e-9)
+
+
+GRADIENTS = [
+    (Stop, orbit_reference.impact_orbit("three impacts"), ("omega", "e")),
+    (gallery.ForcedStickSlip, orbit_reference.forced_stick_slip_orbit("V"), ("omega", "alpha_1")),
+    (gallery.ForcedFriction, orbit_reference.friction_orbit("asymmetric, one stick"), ("omega", "F_stick")),
+    (gallery.Trilinear, orbit_reference.trilinear_orbit("unstable"), ("k_f", "f_0")),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["shooting", "segments"])
+@pytest.mark.parametrize("system, shot, names", GRADIENTS, ids=[case[0].__name__ for case in GRADIENTS])
+def test_gradients(system, shot, names, method):
+    """Of states, event times, amplitude and multipliers, against difference quotients of orbits found anew."""
+
+    def measures(p):
+        parameters = dict(shot.parameters) | dict(zip(names, p))
+        options = METHOD | dict(method=method, throw=False, stepsize_controller=pid(1e-12))
+        orbit = find_orbit(system(**parameters), Motion(*shot.y0), order=shot.order, **options)
+        trace = jnp.sum(orbit.multipliers).real
+        return jnp.stack([orbit.y0.x, orbit.y0.v, orbit.events.t[1], orbit.events.y_before.x[0], trace])
+
+    default = system()
+    p = jnp.array([float(shot.parameters.get(name, getattr(default, name))) for name in names])
+    derivative = jax.jacfwd(measures)(p)
+    step = 2e-5
+    quotient = [(measures(p + step * e) - measures(p - step * e)) / (2 * step) for e in jnp.eye(2)]
+    size = 1 + np.abs(derivative)
+    np.testing.assert_allclose(derivative / size, np.stack(quotient, axis=1) / size, atol=1e-6)
 
 
 @pytest.mark.slow

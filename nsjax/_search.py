@@ -1,0 +1,99 @@
+"""The ways in which a periodic orbit is searched for, one after the other."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+
+from ._cuts import cuts_from, cuts_near, Segment
+from ._guess import repeats, settle_down
+from ._orbit import Orbit
+from ._segments import by_segments
+from ._shooting import shoot
+from ._solution import is_okay, RESULTS
+from ._system import frozen, System
+from ._types import Scalar, Y
+
+
+MORE_PIECES = 16  # in the last try by segments
+
+
+class Search(NamedTuple):
+    """How to search; the arguments of `find_orbit`, checked."""
+
+    t0: Scalar
+    order: int | None
+    mode: Any
+    method: str | None
+    symmetry: Callable[[Y], Y] | None
+    backward: bool
+    segments: Sequence[Segment] | None
+    pieces: int
+    concrete: bool  # whether all numbers are known, so that one try may follow another
+    how: dict  # solver and its bounds
+    newton: dict  # the bounds of Newton's method
+
+    @property
+    def sign(self) -> float:
+        return -1.0 if self.backward else 1.0
+
+    def run(self, system: System, y0: Y, period: Any) -> Orbit:
+        """The orbit that is found from what is known."""
+        if self.segments is not None:
+            cuts = cuts_from(frozen(system), self.segments, self.t0, lax.stop_gradient(y0), self.how)
+            return by_segments(system, cuts, self.t0, self.order or 1, self.pieces, how=self.how, **self.newton)
+        if system.period is None and period is None:
+            return self._from_nothing(system, y0)
+        if self.order is None and system.period is not None:
+            start, _, _ = self._settled(system, y0)
+            order = int(repeats(system, self.t0, start, self.sign, self.how))
+            return self._tries(system, start, jnp.ones_like(self.t0), order, None)
+        period = jnp.asarray(1.0 if period is None else period, self.t0.dtype)
+        if self.concrete and not period > 0:
+            raise ValueError(f"Argument `period` must be positive, but got {period}.")
+        order = self.order or 1
+        orbit = self._tries(system, y0, period, order, self.mode)
+        if self.concrete and not bool(is_okay(orbit.result) | (orbit.result == RESULTS.orbit_is_multiple_cover)):
+            start, period, rests = self._settled(system, y0)
+            if rests:
+                orbit = eqx.tree_at(lambda o: o.result, orbit, RESULTS.orbit_is_equilibrium)
+            if period > 0:
+                second = self._tries(system, start, period, order, None)
+                orbit = second if bool(is_okay(second.result)) else orbit
+        return orbit
+
+    def _settled(self, system: System, y0: Y) -> tuple[Y, Scalar, Any]:
+        return settle_down(frozen(system), self.t0, lax.stop_gradient(y0), self.sign, self.mode, self.how)
+
+    def _from_nothing(self, system: System, y0: Y) -> Orbit:
+        """Of an autonomous system, without a guess of the period."""
+        start, period, rests = self._settled(system, y0)
+        lost = ~(period > 0)
+        orbit = self._tries(system, start, jnp.where(lost, 1, period), 1, None)
+        end = RESULTS.where(rests, RESULTS.orbit_is_equilibrium, RESULTS.orbit_not_found)
+        return eqx.tree_at(lambda o: o.result, orbit, RESULTS.where(lost, end, orbit.result))
+
+    def _tries(self, system: System, y0: Y, period: Scalar, order: int, mode: Any) -> Orbit:
+        """In the formulation asked for, or in one after the other until one finds it."""
+        shoots = self.method != "segments" and self.pieces == 1
+        orbit = self._once(system, y0, period, order, mode, None if shoots else self.pieces)
+        if self.concrete and shoots and self.method is None and self.symmetry is None and not self.backward:
+            for pieces in (1, MORE_PIECES):
+                if orbit.result == RESULTS.orbit_not_found:
+                    other = self._once(system, y0, period, order, mode, pieces)
+                    orbit = other if is_okay(other.result) else orbit
+        return orbit
+
+    def _once(self, system: System, y0: Y, period: Scalar, order: int, mode: Any, pieces: int | None) -> Orbit:
+        """By shooting, or by segments in so many pieces."""
+        t0, how = self.t0, self.how
+        if pieces is None:
+            return shoot(system, t0, y0, period, order, self.symmetry, self.backward, mode, how=how, **self.newton)
+        cuts, closes = cuts_near(frozen(system), t0, lax.stop_gradient(y0), period, order, mode, how)
+        if self.concrete:  # without the rows that are only there to fill up
+            cuts = cuts.first(int(cuts.num) + 1)
+        orbit = by_segments(system, cuts, t0, order, pieces, how=how, **self.newton)
+        result = RESULTS.where(closes, orbit.result, RESULTS.orbit_not_found)
+        return eqx.tree_at(lambda o: o.result, orbit, result)
