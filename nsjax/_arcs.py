@@ -70,9 +70,13 @@ class Flows(eqx.Module):
     pieces: int = eqx.field(static=True)
     how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
 
+    @property
+    def model(self) -> Model:
+        return model_of(self.system, self.t0, self.y0)
+
     def piece(self, a: Scalar, b: Scalar, x: Array, state: State, saveat: dfx.SaveAt) -> Any:
         unravel = jfu.ravel_pytree(self.y0)[1]
-        smooth = Smooth(model_of(self.system, self.t0, self.y0), state)
+        smooth = Smooth(self.model, state)
         sol = solve(smooth, a, b, unravel(x), saveat=saveat, throw=False, **dict(self.how))
         flat = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys)
         return jax.tree.map(lambda y: jnp.where(is_okay(sol.result), y, jnp.nan), flat)
@@ -129,15 +133,20 @@ class Flows(eqx.Module):
         return jax.vmap(one)(times)
 
 
+def flows_of(
+    system: System, arcs: Arcs, how: tuple[tuple[str, Any], ...]
+) -> tuple[Flows, Float[Array, "arcs pieces n"]]:
+    """The flows along the arcs of an orbit, and the states at the beginnings of their pieces."""
+    y0, first = (jax.tree.map(lambda y, i=i: y[i], arcs.y) for i in ((0, 0), (slice(None), 0)))
+    model = model_of(system, arcs.begin[0], y0)
+    within = jax.vmap(lambda t, y, mode: states(model, t, y, tuple(mode)))(arcs.begin, first, arcs.mode)
+    x = jax.vmap(jax.vmap(lambda y: jfu.ravel_pytree(y)[0]))(arcs.y)
+    return Flows(system, within, arcs.begin[0], y0, x.shape[1], how), x
+
+
 @eqx.filter_jit
 def path_of(system: System, arcs: Arcs, samples: int, how: tuple[tuple[str, Any], ...]) -> Path:
     """States along the arcs."""
-    flat = jax.vmap(jax.vmap(lambda y: jfu.ravel_pytree(y)[0]))(arcs.y)
-    y0 = jax.tree.map(lambda y: y[0, 0], arcs.y)
-    unravel = jfu.ravel_pytree(y0)[1]
-    model = model_of(system, arcs.begin[0], y0)
-    first = jax.tree.map(lambda y: y[:, 0], arcs.y)
-    within = jax.vmap(lambda t, y, mode: states(model, t, y, tuple(mode)))(arcs.begin, first, arcs.mode)
-    flows = Flows(system, within, arcs.begin[0], y0, flat.shape[1], how)
-    ts, xs = flows.paths(arcs.begin, arcs.end, flat, samples)
-    return Path(ts, jax.vmap(jax.vmap(unravel))(xs), arcs.mode)
+    flows, x = flows_of(system, arcs, how)
+    ts, xs = flows.paths(arcs.begin, arcs.end, x, samples)
+    return Path(ts, jax.vmap(jax.vmap(jfu.ravel_pytree(flows.y0)[1]))(xs), arcs.mode)

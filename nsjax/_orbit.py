@@ -1,5 +1,6 @@
 """A periodic orbit, with its Floquet multipliers."""
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ._arcs import Arcs, model_of, Path, path_of, SAMPLES
+from ._extremum import largest
 from ._floquet import trivial
 from ._saltation import saltation_matrices, states
 from ._solution import Events, Itinerary, RESULTS, Solution
@@ -111,6 +113,21 @@ class Orbit(eqx.Module):
         **Returns:** a `Path` with `t`, `y` and `mode`, one row for each arc; those past the last have no length.
         """
         return path_of(self.system, self.arcs, samples, self.options)
+
+    def maximum(self, of: Callable[[Scalar, Y], Scalar]) -> Scalar:
+        """The largest value along the orbit of a quantity of the state, with derivatives by the parameters.
+
+        ```python
+        amplitude = orbit.maximum(lambda t, y: jnp.abs(y.x))  # as in Figs. 6.12 to 6.21
+        ```
+
+        **Arguments:**
+
+        - `of`: a function of time and state, smooth along each arc but where it is not largest.
+
+        **Returns:** the value, in the unit of `of`. Derivatives jump where the maximum does from one place to another.
+        """
+        return largest(self.system, self.arcs, self.options, of)
 
     def solve(self, *, saveat: dfx.SaveAt = dfx.SaveAt(dense=True), periods: float = 1, **kwargs: Any) -> Solution:
         """The solution over one or several periods from the base point; further arguments as for `nsjax.solve`.

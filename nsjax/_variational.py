@@ -108,20 +108,19 @@ def monodromy_by_arcs(
 
 
 class _Arc(System):
-    """y and Φ on an arc in a fixed mode: a smooth system, Φ' = (∂f/∂y) Φ."""
+    """y and Φ on an arc in a fixed mode: a smooth system, Φ' = (∂f/∂y) Φ. Its columns are perturbations, of the
+    structure of the state, with one leading axis."""
 
     model: Model
     state: State
 
     def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
-        y, phi = y
-        flat, unravel = jfu.ravel_pytree(y)
+        y, columns = y
 
-        def rhs(x: Array) -> Array:
-            return jfu.ravel_pytree(self.model.flow(t, unravel(x), self.state))[0]
+        def rhs(y: Y) -> Y:
+            return self.model.flow(t, y, self.state)
 
-        columns = jax.vmap(lambda column: jax.jvp(rhs, (flat,), (column,))[1], in_axes=1, out_axes=1)(phi)
-        return self.model.flow(t, y, self.state), columns
+        return rhs(y), jax.vmap(lambda column: jax.jvp(rhs, (y,), (column,))[1])(columns)
 
 
 @eqx.filter_jit
@@ -147,6 +146,9 @@ def _by_arcs(
         later = jnp.where(happened[:, None, None], saltation_matrices(system, sol.events), eye)
         jumps = jnp.concatenate([jumps, later])
 
+    def matrix(columns: Y) -> Array:
+        return jax.vmap(lambda column: jfu.ravel_pytree(column)[0], out_axes=1)(columns)
+
     def arc(phi: Array, row: tuple) -> tuple[Array, Array]:
         a, b, y, mode, jump = row
         smooth = _Arc(model, states(model, a, y, tuple(mode)))
@@ -155,10 +157,11 @@ def _by_arcs(
         inside = jnp.clip(times, low, high)
         order = jnp.argsort(jnp.where(b >= a, inside, -inside))
         out = solve(
-            smooth, a, b, (y, jump @ phi), saveat=dfx.SaveAt(ts=inside[order]),
+            smooth, a, b, (y, jax.vmap(unravel, in_axes=1)(jump @ phi)), saveat=dfx.SaveAt(ts=inside[order]),
             solver=solver, stepsize_controller=controller, max_steps=max_steps, throw=False,
         )  # fmt: skip
-        return out.y1[1], jnp.zeros_like(out.ys[1]).at[order].set(out.ys[1])
+        along = jax.vmap(matrix)(out.ys[1])
+        return matrix(out.y1[1]), jnp.zeros_like(along).at[order].set(along)
 
     _, by_arc = lax.scan(arc, eye, (begin, end, state, modes, jumps))
     # Each time belongs to the arc that ends at or after it; the first one wins, so that Φ is that before a jump.

@@ -40,6 +40,7 @@ ORDER = (
     "_variational",
     "_arcs",
     "_floquet",
+    "_extremum",
     "_regularise",
     "_sweep",
     "_orbit",

@@ -78,6 +78,16 @@ def test_sections_3_4_and_6_7(classic, c):
         assert np.all(np.abs(x + c * v)[mode == 0] <= 2 + 1e-9)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [nsjax.Taylor(), nsjax.Exponential()])
+@pytest.mark.parametrize("method", ["shooting", "segments"])
+def test_other_solvers(classic, solver, method):
+    options = METHOD | dict(solver=solver, method=method)
+    orbit = find_orbit(gallery.StickSlip(), Motion(2.02, 0.0), period=13.54, **options)
+    np.testing.assert_allclose(orbit.period, classic.period, atol=1e-11)
+    np.testing.assert_allclose(orbit.multipliers, [1, 0], atol=1e-10)
+
+
 def test_section_2_4():
     orbit = find_orbit(gallery.FallingStickSlip(), Motion(1.1, 0.0), period=12.0, **METHOD)
     check_stick_slip(orbit, reference.friction_curve_orbit())
@@ -253,6 +263,29 @@ def test_forced_orbit_and_its_derivative():
     assert result == RESULTS.successful
     np.testing.assert_allclose(y0, exact(*p), atol=1e-10)
     np.testing.assert_allclose(derivative, jnp.stack(jax.jacfwd(exact, (0, 1, 2))(*p), -1), atol=1e-8)
+
+
+def test_maximum():
+    """The amplitude of a resonator, with its first and second derivatives; it lies between the samples."""
+
+    def amplitude(p):
+        orbit = find_orbit(Resonator(c=p[0], omega=p[1]), Motion(0.0, 0.0), throw=False, **METHOD)
+        return orbit.maximum(lambda t, y: jnp.abs(y.x))
+
+    def exact(p):
+        return 1 / jnp.hypot(1 - p[1] ** 2, p[0] * p[1])
+
+    p = jnp.asarray([0.2, 0.7])
+    np.testing.assert_allclose(amplitude(p), exact(p), rtol=1e-11)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(amplitude))(p), jax.grad(exact)(p), rtol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(amplitude)))(p), jax.hessian(exact)(p), rtol=1e-7)
+
+
+def test_maximum_of_an_orbit_that_sticks(classic):
+    """1 + √(1 + v²) in slip, at a state that Fig. 3.7 begins with; v_dr in stick, where it is not one place alone."""
+    np.testing.assert_allclose(classic.maximum(lambda t, y: y.x), 1 + np.hypot(1, 0.2), rtol=1e-11)
+    np.testing.assert_allclose(classic.maximum(lambda t, y: y.v), 0.2, rtol=1e-11)
+    np.testing.assert_allclose(classic.maximum(lambda t, y: -y.v), np.hypot(1, 0.2), rtol=1e-11)
 
 
 def test_reverse_mode():

@@ -43,7 +43,9 @@ def search(system, low, high, period=None, **options):
 def check(system, orbits, sign=1.0, perturbed=None):
     """Every orbit returns, by another solver and no sooner than it says, and is as stable as it says."""
     good = np.flatnonzero(np.asarray(is_okay(orbits.result)))
-    y0, period, multipliers = jax.tree.map(lambda x: jnp.asarray(x[good]), (orbits.y0, orbits.period, orbits.multipliers))
+    y0, period, multipliers = jax.tree.map(
+        lambda x: jnp.asarray(x[good]), (orbits.y0, orbits.period, orbits.multipliers)
+    )
     for number in (ravel(y0), period, orbits.residual[good], np.abs(multipliers)):
         assert not np.any(np.isnan(number))
     mode = jnp.asarray(orbits.mode[good])
