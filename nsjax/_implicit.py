@@ -16,17 +16,24 @@ from ._system import frozen
 
 
 def find_root(
-    residual: Callable[[Any, Any], Any], guess: Any, parameters: Any, tol: float, max_iterations: int
+    residual: Callable[[Any, Any], Any],
+    guess: Any,
+    parameters: Any,
+    tol: float,
+    max_iterations: int,
+    *,
+    well_posed: bool | None = None,
 ) -> tuple[Any, Bool[Array, ""]]:
     """A root of `residual(z, parameters)` by optimistix's Newton method, and whether it converged.
 
     The root's derivatives with respect to the parameters, of every order, are those of the implicit function. They are
     not numbers where there is no root, or where it is not regular: optimistix's own rule raises an error there, which
-    one bad lane of a batch would do for all.
+    one bad lane of a batch would do for all. Where roots may not be isolated (`well_posed=False`) the steps are the
+    shortest ones.
     """
     found = optx.root_find(
         lambda z, p: dense_jacobian(residual, z, p),
-        optx.Newton(rtol=tol, atol=tol),
+        optx.Newton(rtol=tol, atol=tol, linear_solver=lx.AutoLinearSolver(well_posed=well_posed)),
         frozen(guess),
         args=frozen(parameters),
         max_steps=max_iterations,

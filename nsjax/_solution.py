@@ -57,6 +57,10 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "A reset left the state on the wrong side of its surface (h < 0), or still approaching it (dh/dt < 0). Check "
         "the signs in the method decorated with `.reset` (or a coefficient of restitution below 0)."
     )
+    equilibrium_not_found = (
+        "No equilibrium was found: Newton's method did not converge. Start nearer to one, give another `mode`, or "
+        "check that the field vanishes anywhere."
+    )
     orbit_not_found = (
         "No periodic orbit was found: Newton's method did not converge. Start nearer to one "
         "(`y0`, `period`), or check that the system has one."

@@ -48,6 +48,8 @@ ORDER = (
     "_shooting",
     "_cuts",
     "_segments",
+    "_equilibrium",
+    "_find_equilibrium",
     "_search",
     "_find_orbit",
     "_work_precision",

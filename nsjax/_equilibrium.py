@@ -1,0 +1,215 @@
+"""Equilibria: in a region, on surfaces that hold them, and virtual ones."""
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from ._filippov import Model, State
+from ._floquet import eigenvalues
+from ._implicit import find_root
+from ._solution import RESULTS
+from ._system import frozen, impact, relay, System
+from ._types import Scalar, Y
+
+
+class Equilibrium(eqx.Module):
+    """A state that does not change.
+
+    **Attributes:**
+
+    - `y`, `mode`: the state, and the mode in which it is one: where this holds it on a surface, a pseudo-equilibrium.
+    - `multipliers`: the values of the switches there: ±1, of a relay 0 or 1, λ of a surface that holds it, the force
+        of a contact.
+    - `jacobian`: ∂f/∂y in this mode, of the field (2.19) on surfaces that hold it; shape `(n, n)`, for the state
+        flattened by `ravel_pytree`.
+    - `eigenvalues`: of what can move, largest real part first: in `n` minus `held` directions, those left out being not
+        numbers.
+    - `held`: how many directions the surfaces take: one each, a contact two.
+    - `stable`: whether all eigenvalues have negative real parts, and the surfaces attract.
+    - `admissible`: whether it lies where its mode does: on its sides of the surfaces, with |λ| within its bound, a
+        contact force that pushes. If not it is virtual.
+    - `boundary`: whether it lies on a surface that does not hold it: there a neighbouring region has it too, and the
+        Jacobian is one-sided.
+    - `isolated`: whether there is no other one nearby. (Sticking friction alone holds in many places.)
+    - `residual`: the largest component of the field.
+    - `result`: `RESULTS`.
+    """
+
+    system: System
+    y: Y
+    mode: Int[Array, " switches"]
+    multipliers: Float[Array, " switches"]
+    jacobian: Float[Array, "n n"]
+    eigenvalues: Complex[Array, " n"]
+    held: Int[Array, ""]
+    stable: Bool[Array, ""]
+    admissible: Bool[Array, ""]
+    boundary: Bool[Array, ""]
+    isolated: Bool[Array, ""]
+    residual: Scalar
+    result: RESULTS
+
+    def __str__(self) -> str:
+        names = [k.name for k in self.system.switches]
+        where = ", ".join(f"{n} {int(m):+d}" for n, m in zip(names, self.mode)) or "no switches"
+        values = ", ".join(f"{n} {float(v):.6g}" for n, v in zip(names, self.multipliers)) or "none"
+        state = ", ".join(f"{float(x):.12g}" for x in jfu.ravel_pytree(self.y)[0])
+        free = len(self.eigenvalues) - int(self.held)
+        roots = ", ".join(f"{complex(z):.6g}" for z in self.eigenvalues[:free]) or "none"
+        kind = "stable" if self.stable else "unstable"
+        words = [kind] + ["virtual"] * (not self.admissible) + ["not isolated"] * (not self.isolated)
+        return (
+            f"{', '.join(words)} equilibrium of {type(self.system).__name__}\n"
+            f"  state        y = ({state})\n"
+            f"  mode         {where}{' (on a surface)' if self.boundary else ''}\n"
+            f"  switches     {values}\n"
+            f"  eigenvalues  {roots}\n"
+            f"  residual     {float(self.residual):.1e}\n"
+        )
+
+
+@eqx.filter_jit
+def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, max_iterations: int) -> Equilibrium:
+    """Newton's method on f(y, s) = 0 in a given mode, with the values of the surfaces that hold the state as unknowns
+    beside it, and h = 0 there as their equations."""
+    x0, unravel = jfu.ravel_pytree(lax.stop_gradient(y0))
+    n = len(x0)
+    model = Model(frozen(system), jnp.ones_like(t), t, y0)
+    holdable = model.holdable
+    state = _state(model, t, y0, mode)
+
+    def values(model: Model, sigma: Array) -> tuple:
+        s = list(model.signs(t, state))
+        for i, k in enumerate(holdable):
+            s[k] = sigma[i]
+        return tuple(s)
+
+    def residual(z: tuple, system: System) -> tuple:
+        x, sigma = z
+        model = Model(system, jnp.ones_like(t), t, y0)
+        y, rest = unravel(x), model.signs(t, state)
+        surface = [_surface(model, k, t, y, state) for k in holdable]
+        rows = [
+            jnp.where(model.held(k, state.mode[k]), h, sigma[i] - rest[k])
+            for i, (k, h) in enumerate(zip(holdable, surface))
+        ]
+        return ravel(model.field(t, y, values(model, sigma))), jnp.stack(rows) if rows else sigma
+
+    # Where a surface holds all along it, the values that keep it there are those of the nearest place.
+    begin, signs = model.values(t, y0, state), model.signs(t, state)
+    sigma = [jnp.where(jnp.isfinite(begin[k]), begin[k], signs[k]) for k in holdable]
+    sigma = jnp.stack(sigma) if sigma else jnp.zeros(0, t.dtype)
+    z, converged = find_root(residual, frozen((x0, sigma)), system, tol, max_iterations, well_posed=False)
+    still = frozen(z)
+    error = jnp.max(jnp.abs(jnp.concatenate([r.ravel() for r in residual(still, frozen(system))])))
+    whole = jax.jacfwd(lambda z: jfu.ravel_pytree(residual(jfu.ravel_pytree(still)[1](z), frozen(system)))[0])
+    singular = jnp.linalg.svd(whole(jfu.ravel_pytree(still)[0]), compute_uv=False)
+    isolated = singular[-1] > 1e-10 * singular[0]
+
+    live = Model(system, jnp.ones_like(t), t, y0)
+    y, s = unravel(z[0]), values(live, z[1])
+    jacobian = jax.jacfwd(lambda x: ravel(live.flow(t, unravel(x), state)))(z[0])
+    roots, held, attracts = _spectrum(live, t, y, state, s, jacobian)
+    admissible, boundary = _place(model, t, frozen(y), state, frozen(s))
+    size = 1 + jnp.max(jnp.abs(z[0]))
+    good = converged & (error <= 1e3 * tol * size)
+    free = jnp.arange(n, dtype=held.dtype) < n - held
+    return Equilibrium(
+        system=system,
+        y=y,
+        mode=jnp.stack(state.mode) if state.mode else jnp.zeros(0, jnp.int32),
+        multipliers=jnp.stack([jnp.asarray(v, t.dtype) for v in s]) if s else jnp.zeros(0, t.dtype),
+        jacobian=jacobian,
+        eigenvalues=roots,
+        held=held,
+        stable=jnp.all(jnp.where(free, roots.real < 0, True)) & attracts,
+        admissible=admissible,
+        boundary=boundary,
+        isolated=isolated,
+        residual=error,
+        result=RESULTS.where(good, RESULTS.successful, RESULTS.equilibrium_not_found),
+    )
+
+
+def ravel(y: Y) -> Array:
+    return jfu.ravel_pytree(y)[0]
+
+
+def _state(model: Model, t: Scalar, y: Y, mode: tuple) -> State:
+    """The mode, with the component of h nearest to zero where h < 0 or on it, and its least one elsewhere."""
+    parts = []
+    for k, switch in enumerate(model.switches):
+        one = model.parts[k] == 1 or isinstance(switch, relay)
+        parts.append(None if one else jnp.argmin(jnp.stack(model.h(k, t, y))).astype(jnp.int32))
+    return State(mode, tuple(parts), tuple(jnp.zeros((), jnp.int32) for _ in mode))
+
+
+def _surface(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+    h = jnp.stack(model.h(k, t, y))
+    return h[0 if state.part[k] is None else state.part[k]]
+
+
+def _spectrum(
+    model: Model, t: Scalar, y: Y, state: State, s: tuple, jacobian: Float[Array, "n n"]
+) -> tuple[Complex[Array, " n"], Int[Array, ""], Bool[Array, ""]]:
+    """The eigenvalues of the directions along the surfaces that hold the state, how many are taken, and whether these
+    surfaces attract (2.24)."""
+    n = len(jacobian)
+    held, attracts = jnp.zeros((), jnp.int32), jnp.ones((), bool)
+    normals = []
+    unravel = jfu.ravel_pytree(y)[1]
+    x = ravel(y)
+    for k in model.holdable:
+        on = model.held(k, state.mode[k])
+        contact = k in model.contacts
+        held = held + jnp.where(on, 2 if contact else 1, 0)
+        gradients = [jax.grad(lambda x, k=k: model.level(k, t, unravel(x), state))(x)]
+        if contact:
+            gradients.append(jax.grad(lambda x, k=k: _surface(model, k, t, unravel(x), state))(x))
+        else:
+            slope = jax.jacfwd(lambda v, k=k: model.rates((k,), t, y, state, s[:k] + (v,) + s[k + 1 :])[0])(s[k])
+            attracts = attracts & jnp.where(on, slope < 0, True)
+        normals += [jnp.where(on, g / jnp.linalg.norm(g), 0) for g in gradients]
+    if not normals:
+        return _ordered(eigenvalues(jacobian), n - held), held, attracts
+    # Off the surfaces every perturbation is given a rate that no other has, and told from them by its place.
+    q = jnp.linalg.svd(lax.stop_gradient(jnp.stack(normals)), full_matrices=True)[2]
+    along = jnp.arange(n, dtype=held.dtype) >= held
+    keep = jnp.outer(along, along)
+    turned = q @ jacobian @ q.T
+    far = -10 * (1 + jnp.max(jnp.abs(lax.stop_gradient(jacobian)))) * n
+    distinct = jnp.diag(jnp.where(along, 0, far * (1 + jnp.arange(n, dtype=x.dtype))))
+    return _ordered(eigenvalues(jnp.where(keep, turned, 0) + distinct), n - held), held, attracts
+
+
+def _ordered(roots: Complex[Array, " n"], free: Array) -> Complex[Array, " n"]:
+    """Largest real part first; what is not free comes last, and is not a number."""
+    order = jnp.argsort(-lax.stop_gradient(roots).real)
+    index = jnp.arange(len(roots), dtype=jnp.int32)
+    return jnp.where(index < jnp.asarray(free, jnp.int32), roots[order], jnp.nan)
+
+
+def _place(model: Model, t: Scalar, y: Y, state: State, s: tuple) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether the state lies where its mode does, and whether on a surface that does not hold it."""
+    admissible, boundary = jnp.ones((), bool), jnp.zeros((), bool)
+    for k, switch in enumerate(model.switches):
+        mode = state.mode[k]
+        if isinstance(switch, relay):
+            on, off = switch.guard(model.system, t, y), switch.off_guard(model.system, t, y)
+            admissible = admissible & (jnp.where(mode == 1, off, on) <= 0)
+            continue
+        parts = jnp.stack(model.h(k, t, y))
+        h, slack = jnp.min(parts), 1e3 * jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y)) + 1e-9
+        on = jnp.abs(h) <= slack
+        side = (h >= -slack) if isinstance(switch, impact) else (mode.astype(h.dtype) * h >= -slack)
+        if k not in model.holdable:
+            admissible, boundary = admissible & side, boundary | on
+            continue
+        held = model.held(k, mode)
+        within = s[k] >= -1e-9 if k in model.contacts else jnp.abs(s[k]) <= model.bound(k) * (1 + 1e-9)
+        admissible = admissible & jnp.where(held, within & (h >= -slack), side)
+        boundary = boundary | (on & ~held)
+    return admissible, boundary
