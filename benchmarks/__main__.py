@@ -13,6 +13,7 @@ RUNS = (
     ("sweep.py", "--workload", "S1", "S2", "S3", "--batch", "256", "--out", "sweep.json"),
     ("cost.py", "--out", "cost.json"),
     ("growth.py", "--out", "growth"),
+    ("orbits.py", "--out", "orbits.json"),
     ("work_precision.py", "--out", "work_precision"),
 )
 

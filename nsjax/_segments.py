@@ -141,14 +141,15 @@ def by_segments(
     cuts = frozen(cuts)
     y0 = jax.tree.map(lambda x: x[0], cuts.y)
     cycle = _Cycle(cuts, t0, y0, order, pieces, tuple(how.items()))
-    guess, rates, normal = cycle.first_look(still)
+    guess, rates, normal = frozen(cycle).first_look(still)
 
-    def residual(z: tuple, system: System) -> tuple:
+    def residual(z: tuple, parameters: tuple) -> tuple:
+        system, cycle = parameters
         return cycle.residual(z, system, rates, normal)
 
-    z, converged = find_root(residual, guess, system, tol, max_iterations)
+    z, converged = find_root(residual, guess, (system, cycle), tol, max_iterations)
     begin, end, x = z
-    error = jnp.max(jnp.abs(jnp.concatenate([r.ravel() for r in residual(frozen(z), still)])))
+    error = jnp.max(jnp.abs(jnp.concatenate([r.ravel() for r in residual(frozen(z), (still, cycle))])))
     size = 1 + jnp.max(jnp.abs(x))
     good = converged & (error <= 1e3 * tol * size)
     period = end[-1] - t0 if autonomous else jnp.asarray(system.period, t0.dtype) * order

@@ -45,16 +45,20 @@ def shoot(
     sign = -1.0 if backward else 1.0
     autonomous = system.period is None
     still = frozen(system)
-    model = Model(still, jnp.ones_like(t0), t0, y0)
     guess = lax.stop_gradient(y0)
+    model = Model(still, jnp.ones_like(frozen(t0)), frozen(t0), guess)
     if autonomous:
-        guess, period = lax.stop_gradient(base_point(still, t0, guess, lax.stop_gradient(period), sign, mode, how))
+        guess, period = lax.stop_gradient(
+            base_point(still, frozen(t0), guess, lax.stop_gradient(period), sign, mode, how)
+        )
         mode = None
     flat, unravel = jfu.ravel_pytree(guess)
     first_period = lax.stop_gradient(period)
-    forcing = None if autonomous else jnp.asarray(system.period, t0.dtype) * order
 
-    def flow(system: System, x: Array, period: Scalar) -> Array:
+    def period_of(z: tuple, system: System) -> Scalar:
+        return jnp.exp(z[1]) if autonomous else jnp.asarray(system.period, t0.dtype) * order
+
+    def flow(system: System, t0: Scalar, x: Array, period: Scalar) -> Array:
         sol = solve(system, t0, t0 + sign * period, unravel(x), mode=mode, throw=False, **how)
         # A solution that ended early is no solution: Newton's method must not be led by it.
         ok = is_okay(sol.result)
@@ -65,34 +69,26 @@ def shoot(
     def image(x: Array) -> Array:
         return x if symmetry is None else ravel(symmetry(unravel(x)))
 
+    def returns(z: tuple, parameters: tuple) -> Array:
+        system, t0 = parameters
+        return flow(system, t0, z[0], part * period_of(z, system)) - image(z[0])
+
+    unknown: Any = (flat,)
+    residual: Callable[[tuple, tuple], Any] = returns
+    at_rest = jnp.zeros((), bool)
     if autonomous:
         # Poincaré's phase condition: the base point stays on the section through the guess.
-        start = at_start(model, t0, guess)
-        normal = ravel(model.flow(t0, guess, start))
+        normal = ravel(model.flow(frozen(t0), guess, at_start(model, frozen(t0), guess)))
         speed = normal @ normal
 
-        def residual(z: tuple, system: System) -> tuple:
-            x, log_period = z
-            phase = normal @ (x - flat) / jnp.where(speed == 0, 1, speed)
-            return flow(system, x, part * jnp.exp(log_period)) - image(x), phase
+        def on_section(z: tuple, parameters: tuple) -> tuple:
+            return returns(z, parameters), normal @ (z[0] - flat) / jnp.where(speed == 0, 1, speed)
 
-        unknown: Any = (flat, jnp.log(lax.stop_gradient(period)))
+        unknown, residual = (flat, jnp.log(first_period)), on_section
         at_rest = jnp.sqrt(speed) * period <= 1e-9 * (1 + jnp.max(jnp.abs(flat)))
-    else:
-
-        def residual(z: tuple, system: System) -> tuple:
-            assert forcing is not None
-            return (flow(system, z[0], part * forcing) - image(z[0]),)
-
-        unknown = (flat,)
-        at_rest = jnp.zeros((), bool)
-    z, converged = find_root(residual, unknown, system, tol, max_iterations)
-    x = z[0]
-    if autonomous:
-        period = jnp.exp(z[1])
-    else:
-        assert forcing is not None
-        period = forcing
+    # What depends on parameters does so by the second argument alone: the search needs no derivatives.
+    z, converged = find_root(residual, unknown, (system, t0), tol, max_iterations)
+    x, period = z[0], period_of(z, system)
 
     _, shares = fractions(autonomous, order)
     end = t0 + sign * period
