@@ -1,12 +1,20 @@
 """nsjax: differentiable piecewise-smooth dynamics in JAX."""
 
 from . import gallery as gallery, plot as plot
+from ._crossings import (
+    eigenvalue_crossings as eigenvalue_crossings,
+    eigenvalue_path as eigenvalue_path,
+    EigenvalueCurve as EigenvalueCurve,
+    EigenvalueCurves as EigenvalueCurves,
+    EigenvaluePath as EigenvaluePath,
+)
 from ._cuts import Segment as Segment
 from ._equilibrium import Equilibrium as Equilibrium
 from ._exponential import Exponential as Exponential
 from ._find_equilibrium import find_equilibria as find_equilibria, find_equilibrium as find_equilibrium
 from ._find_orbit import find_orbit as find_orbit, find_orbits as find_orbits
 from ._orbit import Orbit as Orbit
+from ._pencil import EigenvalueCrossing as EigenvalueCrossing
 from ._regularise import banded as banded, smoothed as smoothed
 from ._saltation import (
     saltation_matrices as saltation_matrices,

@@ -40,6 +40,8 @@ ORDER = (
     "_variational",
     "_arcs",
     "_floquet",
+    "_pencil",
+    "_crossings",
     "_extremum",
     "_regularise",
     "_sweep",
