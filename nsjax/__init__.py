@@ -13,6 +13,10 @@ from ._equilibrium import Equilibrium as Equilibrium
 from ._exponential import Exponential as Exponential
 from ._find_equilibrium import find_equilibria as find_equilibria, find_equilibrium as find_equilibrium
 from ._find_orbit import find_orbit as find_orbit, find_orbits as find_orbits
+from ._generalized import (
+    generalized_jacobian as generalized_jacobian,
+    GeneralizedJacobian as GeneralizedJacobian,
+)
 from ._orbit import Orbit as Orbit
 from ._pencil import EigenvalueCrossing as EigenvalueCrossing
 from ._regularise import banded as banded, smoothed as smoothed

@@ -52,6 +52,7 @@ ORDER = (
     "_segments",
     "_equilibrium",
     "_find_equilibrium",
+    "_generalized",
     "_search",
     "_find_orbit",
     "_work_precision",
