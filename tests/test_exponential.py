@@ -201,12 +201,15 @@ def test_roots_next_to_each_other(depth):
     np.testing.assert_allclose(sol.t[:, 1], np.pi + half, atol=2e-15 / half)
 
 
-NOT_AFFINE = ("(2.26)", "(2.28)", "2.4", "6.9")
+NOT_AFFINE = (
+    *("(2.26)", "(2.28)", "2.4", "6.9"),
+    *("(5.7)", "(5.10)", "(5.15)", "(5.17)", "(5.23)", "(5.25)", "(5.29)", "(5.40)"),
+)
 
 
 @pytest.mark.parametrize("key", NOT_AFFINE)
 def test_refusal_in_the_gallery(key):
-    """Friction that depends on the velocity smoothly."""
+    """Friction that depends on the velocity smoothly, and the smooth fields of chapter 5."""
     entry = gallery.THESIS[key]
     with pytest.raises(ValueError, match=f"affine in the state, but `{type(entry.system()).__name__}` is not"):
         solve(entry.system(), entry.t0, entry.t1, entry.y0, solver=Exponential())

@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
+import nsjax
 from nsjax import gallery
 from nsjax._system import impact
 
@@ -58,8 +60,33 @@ def support(t, x, v):  # (3.53), (3.54)
     return v, -x + np.cos(1.2 * t)
 
 
-def hopf_pitchfork(t, x1, x2, mu=-1.0):  # (5.32)
-    kinks = abs(x1 + mu) - abs(x1 - mu) - abs(x2 + mu) + abs(x2 - mu)
+def arctan_abs(h):  # the smooth approximation of |h| in chapter 5
+    return 2 / np.pi * np.arctan(10 * h) * h
+
+
+def no_crossing(t, x1, x2):
+    return x2, 1 - (5 if x1 > 0 else 1) * x1 - 2.5 * x2
+
+
+def double_hopf_crossing(t, x1, x2, x3):  # the coefficients of the characteristic polynomial multiply x1
+    a1, a2 = (1, 3) if x1 > 0 else (3, 1)
+    return x2 - a1 * x1, x3 - a2 * x1, 1 - 3.36 * x1
+
+
+def hopf(t, x1, x2):  # (5.27), (5.28), in the complex plane
+    z = complex(x1, x2)
+    rate = z * ((1 + 1j) + (-1 + 1j) * abs(z) ** 2)
+    return rate.real, rate.imag
+
+
+def discontinuous_hopf(t, x1, x2):  # (5.29), at μ = 1
+    r = np.hypot(x1, x2)
+    kinks = abs(r + 0.5) - abs(r - 0.5)
+    return -x1 - x2 + x1 / r * kinks, x1 - x2 + x2 / r * kinks
+
+
+def hopf_pitchfork(t, x1, x2, mu=-1.0, size=abs):  # (5.32), (5.40)
+    kinks = size(x1 + mu) - size(x1 - mu) - size(x2 + mu) + size(x2 - mu)
     return x2, -x1 - x2 + kinks
 
 
@@ -105,7 +132,22 @@ FIELDS = {
     "2.4": falling_stick_slip,
     "3.4": stick_slip,
     "3.5": support,
+    "5.2": no_crossing,
+    "figure 5.3": double_hopf_crossing,
+    "(5.7)": lambda t, x: (1 - x * x,),
+    "(5.8)": lambda t, x: (1 - abs(x),),
+    "(5.10)": lambda t, x: ((1 - x) * x,),
+    "(5.11)": lambda t, x: (0.5 - abs(x - 0.5),),
+    "(5.15)": lambda t, x: (arctan_abs(0.5) + 0.1 - arctan_abs(x - 0.5),),
+    "(5.17)": lambda t, x: (x * (1 - x * x),),
+    "(5.18)": lambda t, x: (-x + abs(x + 0.5) - abs(x - 0.5),),
+    "(5.22)": lambda t, x: (x + abs(x - 0.5) - abs(x + 0.5),),
+    "(5.23)": lambda t, x: (-x + arctan_abs(x + 0.5) + 0.1 - arctan_abs(x - 0.5),),
+    "(5.25)": hopf,
+    "(5.29)": discontinuous_hopf,
+    "(5.30)": lambda t, r, theta: (-r + abs(r + 0.5) - abs(r - 0.5), 1.0),
     "5.7": hopf_pitchfork,
+    "(5.40)": lambda t, x1, x2: hopf_pitchfork(t, x1, x2, size=arctan_abs),
     "6.6": trilinear,
     "6.7": lambda t, x, v: stick_slip(t, x, v, c=0.1),
     "6.8": forced_friction,
@@ -142,19 +184,20 @@ def test_fields_in_each_region(key):
     rng = np.random.default_rng(0)
     dimension = len(gallery.THESIS[key].y0)
     regions = set()
-    for _ in range(40):
+    for _ in range(100):
         t, y = rng.uniform(0, 10), rng.uniform(-2, 2, dimension)
         expected = FIELDS[key](t, *y)
         np.testing.assert_allclose(field(key, t, y), expected, rtol=1e-13, atol=1e-13)
         system = gallery.thesis(key)
         h = [min(map(float, k.components(system, t, state(key, *y)))) for k in system.switches]
         regions.add(tuple(np.sign(h)))
-    assert len(regions) == {0: 1, 1: 2, 2: 3}[len(system.switches)]
+    # μ has one sign in (5.11), r > -μ/2 in (5.29), and the lines of 5.7 make a grid.
+    assert len(regions) == {"(5.11)": 2, "(5.29)": 2, "5.7": 9}.get(key, len(system.switches) + 1)
 
 
 @pytest.mark.parametrize("key", KEYS)
 def test_affine_in_each_switch_value(key):
-    t, y = 0.3, np.array([1.3, 0.7])[: len(gallery.THESIS[key].y0)]
+    t, y = 0.3, np.array([1.3, 0.7, -0.4])[: len(gallery.THESIS[key].y0)]
     n = len(gallery.thesis(key).switches)
     for i in range(n):
         at = [field(key, t, y, [value if j == i else 0.6 for j in range(n)]) for value in (-1.0, 0.5, 1.0)]
@@ -253,13 +296,157 @@ def test_values_of_appendix_c(key):
 @pytest.mark.parametrize("key", KEYS)
 def test_period(key):
     system = gallery.thesis(key)
-    if not hasattr(system, "omega"):
+    if not hasattr(system, "omega") or key in ("(5.25)", "(5.29)", "(5.30)"):  # there it is not that of a force
         assert system.period is None
         return
     np.testing.assert_allclose(system.period, 2 * np.pi / system.omega)
     np.testing.assert_allclose(gallery.thesis(key, omega=0.5).period, 4 * np.pi)
     y = [0.3, 0.4]
     np.testing.assert_allclose(field(key, 0.2, y), field(key, 0.2 + system.period, y), rtol=1e-12)
+
+
+# Chapter 5: fixed points, and what jumps there.
+
+
+def flow(system, y, s=None):
+    """The vector field in the region of the state, or of the signs `s`."""
+    if s is None:
+        s = [float(jnp.sign(jnp.asarray(*k.components(system, 0.0, y)))) for k in system.switches]
+    return jnp.stack(system.vector_field(0.0, y, system.values(tuple(map(jnp.asarray, s)))))
+
+
+def matrix(system, y, s=None):
+    """∂f/∂y there."""
+    return np.array(jax.jacfwd(lambda y: flow(system, y, s))(y)).T
+
+
+FIXED_POINTS = {  # by key, and by the value of the parameter μ if no others are given: the point and its eigenvalues
+    ("5.2", -1.0): [([-1, 0], [-0.5, -2])],
+    ("5.2", 1.0): [([0.2, 0], [-1.25 - 1.8540497j, -1.25 + 1.8540497j])],
+    ("figure 5.3", -1.0): [([-1 / 3.36, -3 / 3.36, -1 / 3.36], np.roots([1, 3, 1, 3.36]))],
+    ("figure 5.3", 1.0): [([1 / 3.36, 1 / 3.36, 3 / 3.36], np.roots([1, 1, 3, 3.36]))],
+    ("(5.7)", 0.25): [([0.5], [-1]), ([-0.5], [1])],
+    ("(5.8)", 0.25): [([0.25], [-1]), ([-0.25], [1])],
+    ("(5.8)", -0.25): [],
+    ("(5.10)", 0.5): [([0], [0.5]), ([0.5], [-0.5])],
+    ("(5.10)", -0.5): [([0], [-0.5]), ([-0.5], [0.5])],
+    ("(5.11)", 0.5): [([0], [1]), ([0.5], [-1])],
+    ("(5.11)", -0.5): [([0], [-1]), ([-0.5], [1])],
+    ("(5.17)", 0.25): [([0], [0.25]), ([0.5], [-0.5]), ([-0.5], [-0.5])],
+    ("(5.17)", -0.25): [([0], [-0.25])],
+    ("(5.17)", -0.25, 1.0): [([0], [-0.25]), ([0.5], [0.5]), ([-0.5], [0.5])],
+    ("(5.17)", 0.25, 1.0): [([0], [0.25])],
+    ("(5.18)", 0.5): [([0], [1]), ([0.5], [-1]), ([-0.5], [-1])],
+    ("(5.18)", -0.5): [([0], [-3])],
+    ("(5.22)", 0.5): [([0], [3])],
+    ("(5.22)", -0.5): [([0], [-1]), ([0.5], [1]), ([-0.5], [1])],
+    ("(5.25)", 0.3): [([0, 0], [0.3 - 1j, 0.3 + 1j])],
+    ("(5.29)", -0.3): [([0, 0], [-3 - 1j, -3 + 1j])],
+    ("(5.29)", 0.3): [([0, 0], [1 - 1j, 1 + 1j])],
+    ("5.7", -0.5): [([0, 0], [0.5 - np.sqrt(11) / 2 * 1j, 0.5 + np.sqrt(11) / 2 * 1j])],  # (5.33)
+    ("5.7", 0.5): [([0, 0], [-1.5 + np.sqrt(13) / 2, -1.5 - np.sqrt(13) / 2])]  # (5.34)
+    + [([x, 0], [-1.5 + np.sqrt(5) / 2, -1.5 - np.sqrt(5) / 2]) for x in (1, -1)],  # (5.35)
+}
+
+
+@pytest.mark.parametrize("case", FIXED_POINTS, ids=str)
+def test_fixed_points(case):
+    key, *values = case
+    system = gallery.thesis(key, **dict(zip(("mu", "alpha"), values)))
+    for values, eigenvalues in FIXED_POINTS[case]:
+        y = state(key, *map(float, values))
+        np.testing.assert_allclose(flow(system, y), 0, atol=1e-15)
+        found = np.linalg.eigvals(matrix(system, y))
+        np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(np.array(eigenvalues, complex)), atol=1e-7)
+    if len(gallery.entry(key).y0) == 1:  # there are no others
+        f = np.array([flow(system, state(key, x)) for x in np.linspace(-2, 2, 202)])
+        assert np.sum(f[1:] * f[:-1] < 0) == len(FIXED_POINTS[case])
+
+
+CROSSINGS = {  # at μ = 0: the signs before and after, and at which q an eigenvalue is where on the imaginary axis
+    "5.2": ([-1], [1], []),
+    "figure 5.3": ([-1], [1], [(0.1, np.sqrt(1.2)), (0.9, np.sqrt(2.8))]),
+    "(5.8)": ([-1], [1], [(1 / 2, 0)]),  # (5.9)
+    "(5.11)": ([-1, 1], [1, 1], [(1 / 2, 0)]),  # (5.12)
+    "(5.18)": ([-1, 1], [1, -1], [(3 / 4, 0)]),  # of the way from x = 0, μ < 0 to x = 0, μ > 0
+    "(5.22)": ([-1, 1], [1, -1], [(1 / 4, 0)]),
+    "(5.29)": ([-1, 1], [1, -1], [(3 / 4, 1)]),
+    "5.7": ([-1, 1, -1, 1], [1, -1, 1, -1], [(1 / 4, np.sqrt(2)), (3 / 4, 0)]),  # (5.36), Fig. 5.13
+}
+
+
+@pytest.mark.parametrize("key", CROSSINGS)
+def test_set_valued_eigenvalues(key):
+    *sides, crossings = CROSSINGS[key]
+    system = gallery.thesis(key, mu=0.0)
+    zero = state(key, *np.zeros(len(gallery.entry(key).y0)))
+    before, after = (matrix(system, zero, np.array(s, float)) for s in sides)
+    for q, omega in crossings:
+        roots = np.linalg.eigvals((1 - q) * before + q * after)
+        np.testing.assert_allclose(np.min(abs(roots - 1j * omega)), 0, atol=1e-12)
+    # There are no other crossings: on the way so many eigenvalues change their sides.
+    path = [np.linalg.eigvals((1 - q) * before + q * after) for q in np.linspace(0, 1, 1002)]
+    unstable = np.array([np.sum(roots.real > 0) for roots in path])
+    assert np.abs(np.diff(unstable)).sum() == sum(2 if omega else 1 for _, omega in crossings)
+    if key == "figure 5.3":
+        assert unstable[0] == unstable[-1] == 2 and unstable[500] == 0
+        assert np.linalg.matrix_rank(after - before) == 1
+
+
+@pytest.mark.parametrize("key", ["(5.11)", "(5.18)"])
+def test_change_of_the_field_with_the_parameter(key):  # (5.13), (5.20)
+    for s in itertools.product((-1.0, 1.0), repeat=2):
+        slope = jax.jacfwd(lambda mu, s=s: flow(gallery.thesis(key, mu=mu), state(key, 0.0), s))(0.0)
+        assert slope == sum(s) / 2
+
+
+@pytest.mark.parametrize("key", CROSSINGS)
+def test_size_in_proportion_to_mu(key):  # (5.37)
+    y = np.array([0.7, -0.4, 0.3])[: len(gallery.entry(key).y0)]
+    for mu in (-1.0, 1.0):
+        one, other = (flow(gallery.thesis(key, mu=k * mu), state(key, *k * y)) for k in (1.0, 3.0))
+        np.testing.assert_allclose(other, 3 * one, rtol=1e-14)
+
+
+@pytest.mark.parametrize("mu", [-0.3, 0.2])
+def test_smooth_approximations(mu):  # (5.15), (5.23), (5.40)
+    for key, smooth, added in (("(5.11)", "(5.15)", 0.1), ("(5.18)", "(5.23)", 0.1), ("5.7", "(5.40)", 0.0)):
+        rough, system = nsjax.smoothed(gallery.thesis(key, mu=mu), 10.0), gallery.thesis(smooth, mu=mu, epsilon=10.0)
+        for values in ([0.3, -0.2], [-0.05, 0.4], [0.0, 0.0]):
+            y = state(key, *values[: len(gallery.entry(key).y0)])
+            np.testing.assert_allclose(flow(system, y), flow(rough, y) + added, atol=1e-15)
+
+
+def test_bifurcations_of_the_smooth_approximations():
+    z = brentq(lambda z: np.arctan(z) + z / (1 + z * z) - np.pi / 4, 0, 1)  # where (2/π) arctan(z) z has the slope 1/2
+    np.testing.assert_allclose([2 * z, z], [0.8832, 0.4416], atol=5e-5)
+    for eps in (10.0, 1e3):
+        for key, mu, want in (
+            ("(5.18)", 2 * z / eps, [0]),
+            ("(5.30)", 2 * z / eps, [0, 0]),
+            ("(5.29)", 2 / np.sqrt(eps), [-1j, 1j]),
+            ("5.7", -z / eps, [-1j * np.sqrt(2), 1j * np.sqrt(2)]),
+            ("5.7", z / eps, [-2, 0]),
+        ):
+            origin = state(key, *np.zeros(len(gallery.entry(key).y0)))
+            roots = np.linalg.eigvals(matrix(nsjax.smoothed(gallery.thesis(key, mu=mu), eps), origin))
+            np.testing.assert_allclose(np.sort_complex(roots), np.array(want, complex), atol=1e-12)
+    fold, x = gallery.thesis("(5.23)", mu=3.23475692 / 50, epsilon=50.0), state("(5.23)", -1.60848606 / 50)
+    np.testing.assert_allclose(flow(fold, x), 0, atol=1e-9)
+    np.testing.assert_allclose(matrix(fold, x), 0, atol=1e-7)
+    for mu in (-0.1, 0.0, 0.1):  # no bifurcation
+        f = [flow(gallery.thesis("(5.15)", mu=mu), state("(5.15)", x)) for x in np.linspace(-1, 1, 102)]
+        assert np.sum(np.diff(np.sign(f), axis=0) != 0) == 2
+    np.testing.assert_allclose(flow(gallery.thesis("(5.15)", mu=0.0, epsilon=50.0), state("(5.15)", 0.0)), 1 / 50)
+
+
+def test_polar_coordinates():  # (5.26)-(5.28), (5.30), (5.31)
+    for r, theta in ((0.2, 0.3), (0.8, 4.0)):
+        turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+        polar = field("(5.30)", 0.0, [r, theta])
+        x = turn @ [r, 0]
+        np.testing.assert_allclose(field("(5.29)", 0.0, x), turn @ [polar[0], r * polar[1]], rtol=1e-14)
+        np.testing.assert_allclose(field("(5.25)", 0.0, x), turn @ [r - r**3, r * (1 + r**2)], rtol=1e-14)
 
 
 def outside_flow(key, y, t1):
@@ -324,13 +511,24 @@ def test_period_of_3_4():
         ("2.4", "2.4"),
         ("Section 6.6", "6.6"),
         ("§6.9", "6.9"),
+        ("5.7", "5.7"),  # a section before an equation
+        ("Section 5.7", "5.7"),
+        ("eq. 5.7", "(5.7)"),
+        ("(5.7)", "(5.7)"),
+        ("eq. (5.32)", "5.7"),
+        ("5.32", "5.7"),
+        ("(5.31)", "(5.30)"),
+        ("5.8", "(5.8)"),
+        ("Fig. 5.3", "figure 5.3"),
     ],
 )
 def test_spellings(spelling, key):
     assert gallery.entry(spelling) is gallery.THESIS[key]
 
 
-@pytest.mark.parametrize("key", ["2.1", "2.1e", "(2.4)", "section 2.3", "example 2.6", "1.1", "1.1(4)", "6.66", ""])
+@pytest.mark.parametrize(
+    "key", ["2.1", "2.1e", "(2.4)", "section 2.3", "example 2.6", "1.1", "1.1(4)", "5.3", "(5.2)", "6.66", ""]
+)
 def test_unknown_key(key):
     with pytest.raises(ValueError, match="Argument `key` must be one of '1.1\\(1\\)'.*'6.9', but got") as error:
         gallery.thesis(key)
@@ -346,7 +544,7 @@ def test_parameters():
 
 
 def test_entries_are_frozen_and_ordered():
-    assert KEYS[0] == "1.1(1)" and KEYS[-1] == "6.9" and len(KEYS) == 19
+    assert KEYS[0] == "1.1(1)" and KEYS[-1] == "6.9" and len(KEYS) == 35
     with pytest.raises(TypeError):
         gallery.THESIS["6.6"] = None
     with pytest.raises(AttributeError):

@@ -3,7 +3,6 @@
 `thesis("6.6")` is the system of section 6.6 with the values of Appendix C; `THESIS` lists them all.
 """
 
-from ._absolute import HopfPitchfork as HopfPitchfork
 from ._block import (
     FallingFrictionBlock as FallingFrictionBlock,
     Slip as Slip,
@@ -19,6 +18,25 @@ from ._examples import (
     SlidingPoint as SlidingPoint,
     StickingPoint as StickingPoint,
     TransversalIntersection as TransversalIntersection,
+)
+from ._fixed_points import (
+    DiscontinuousHopf as DiscontinuousHopf,
+    DiscontinuousPitchfork as DiscontinuousPitchfork,
+    DiscontinuousSaddleNode as DiscontinuousSaddleNode,
+    DiscontinuousTranscritical as DiscontinuousTranscritical,
+    DoubleHopfCrossing as DoubleHopfCrossing,
+    Hopf as Hopf,
+    HopfPitchfork as HopfPitchfork,
+    ImperfectPitchfork as ImperfectPitchfork,
+    ImperfectTranscritical as ImperfectTranscritical,
+    NoCrossing as NoCrossing,
+    Pitchfork as Pitchfork,
+    Polar as Polar,
+    PolarHopf as PolarHopf,
+    SaddleNode as SaddleNode,
+    SmoothHopfPitchfork as SmoothHopfPitchfork,
+    Space as Space,
+    Transcritical as Transcritical,
 )
 from ._forced import ForcedFriction as ForcedFriction, ForcedStickSlip as ForcedStickSlip
 from ._motion import Motion as Motion

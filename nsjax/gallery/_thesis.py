@@ -9,7 +9,6 @@ from typing import Any
 
 from .._system import System
 from .._types import Y
-from ._absolute import HopfPitchfork
 from ._block import FallingFrictionBlock, Slip, SmoothBlock, StaticPointBlock
 from ._examples import (
     AttractionSliding,
@@ -20,6 +19,25 @@ from ._examples import (
     SlidingPoint,
     StickingPoint,
     TransversalIntersection,
+)
+from ._fixed_points import (
+    DiscontinuousHopf,
+    DiscontinuousPitchfork,
+    DiscontinuousSaddleNode,
+    DiscontinuousTranscritical,
+    DoubleHopfCrossing,
+    Hopf,
+    HopfPitchfork,
+    ImperfectPitchfork,
+    ImperfectTranscritical,
+    NoCrossing,
+    Pitchfork,
+    Polar,
+    PolarHopf,
+    SaddleNode,
+    SmoothHopfPitchfork,
+    Space,
+    Transcritical,
 )
 from ._forced import ForcedFriction, ForcedStickSlip
 from ._motion import Motion
@@ -48,6 +66,7 @@ class Entry:
     t1: float  # end time [s]
     t0: float = 0.0  # start time [s]
     orbit: OrbitGuess | None = None
+    also: tuple[str, ...] = ()  # other numbers of the system in the thesis
 
 
 # The guesses come from simulations outside this library (scipy, the mechanical reading of the friction laws), and are
@@ -110,13 +129,74 @@ _ENTRIES = (
         t1=80.0,
         orbit=OrbitGuess(Motion(1.110, 1.338)),
     ),
+    Entry("5.2", "Jump of the Jacobian without a crossing (ours)", NoCrossing, y0=Plane(-0.5, 0.0), t1=10.0),
+    Entry(
+        "figure 5.3",
+        "Discontinuous bifurcation: one pair of eigenvalues crosses twice (ours)",
+        DoubleHopfCrossing,
+        y0=Space(1.0, 0.0, 0.0),
+        t1=20.0,
+        orbit=OrbitGuess(Space(0.8748, 0.8748, 0.9316), period=3.872),
+    ),
+    Entry("(5.7)", "Saddle-node bifurcation, smooth", SaddleNode, y0=Line(-0.5), t1=5.0),
+    Entry("(5.8)", "Saddle-node bifurcation, discontinuous", DiscontinuousSaddleNode, y0=Line(-0.5), t1=8.0),
+    Entry("(5.10)", "Transcritical bifurcation, smooth", Transcritical, y0=Line(0.1), t1=10.0),
+    Entry("(5.11)", "Transcritical bifurcation, discontinuous", DiscontinuousTranscritical, y0=Line(0.1), t1=10.0),
+    Entry(
+        "(5.15)", "Transcritical bifurcation, smoothed without symmetry", ImperfectTranscritical, y0=Line(0.1), t1=10.0
+    ),
+    Entry("(5.17)", "Pitchfork bifurcation, smooth", Pitchfork, y0=Line(0.1), t1=8.0),
+    Entry(
+        "(5.18)", "Pitchfork bifurcation, discontinuous and supercritical", DiscontinuousPitchfork, Line(0.1), t1=8.0
+    ),
+    Entry(
+        "(5.22)",
+        "Pitchfork bifurcation, discontinuous and subcritical",
+        partial(DiscontinuousPitchfork, mu=-1.0, alpha=1.0),
+        y0=Line(0.9),
+        t1=8.0,
+    ),
+    Entry("(5.23)", "Pitchfork bifurcation, smoothed without symmetry", ImperfectPitchfork, y0=Line(-0.2), t1=8.0),
+    Entry(
+        "(5.25)",
+        "Hopf bifurcation, smooth",
+        Hopf,
+        y0=Plane(0.1, 0.0),
+        t1=20.0,
+        orbit=OrbitGuess(Plane(1.0, 0.0), period=3.1416),
+    ),
+    Entry(
+        "(5.29)",
+        "Hopf bifurcation, discontinuous",
+        DiscontinuousHopf,
+        y0=Plane(0.1, 0.0),
+        t1=20.0,
+        orbit=OrbitGuess(Plane(1.0, 0.0), period=6.2832),
+    ),
+    Entry(
+        "(5.30)",
+        "Hopf bifurcation, discontinuous, in polar coordinates",
+        PolarHopf,
+        y0=Polar(0.1, 0.0),
+        t1=8.0,
+        also=("(5.31)",),
+    ),
     Entry(
         "5.7",
         "Hopf-pitchfork bifurcation of a non-smooth continuous system",
         HopfPitchfork,
         y0=Plane(0.5, 0.0),
         t1=20.0,
-        orbit=OrbitGuess(Plane(1.5, 0.0), period=4.03),
+        orbit=OrbitGuess(Plane(1.546, 0.0), period=4.031),
+        also=("(5.32)", "(5.38)"),
+    ),
+    Entry(
+        "(5.40)",
+        "Hopf-pitchfork bifurcation, smooth approximation",
+        SmoothHopfPitchfork,
+        y0=Plane(0.5, 0.0),
+        t1=20.0,
+        orbit=OrbitGuess(Plane(1.546, 0.0), period=4.033),
     ),
     Entry(
         "6.6",
@@ -165,6 +245,8 @@ _WORDS = {
     "sec": "section",
     "§": "section",
     "table": "table",
+    "figure": "figure",
+    "fig": "figure",
 }
 
 
@@ -177,8 +259,8 @@ def _parse(key: str) -> tuple[str, tuple[int, ...]] | None:
     return kind, tuple(int(n) for n in re.findall(r"\d+", key))
 
 
-def _kind(entry: Entry) -> tuple[str, tuple[int, ...]]:
-    parsed = _parse(entry.key)
+def _kind(key: str) -> tuple[str, tuple[int, ...]]:
+    parsed = _parse(key)
     assert parsed is not None
     kind, numbers = parsed
     return kind or ("table" if len(numbers) == 3 else "section"), numbers
@@ -190,16 +272,21 @@ def entry(key: str) -> Entry:
     **Arguments:**
 
     - `key`: one of `THESIS`, or a sensible spelling of it: "Example 2.1", "eq 2.3", "section 6.6", "1.1.1". A bare
-      number never means an example.
+      number means a section before it means an equation, "5.7" not "(5.7)", and never an example or a figure.
 
     **Raises:** `ValueError`, naming the possible keys.
     """
     asked = _parse(key)
+    fitting = {}
     for found in _ENTRIES:
-        kind, numbers = _kind(found)
-        if asked is not None and asked[1] == numbers and (asked[0] == kind or asked[0] == "" and kind != "example"):
-            return found
-    raise ValueError(f"Argument `key` must be one of {', '.join(map(repr, THESIS))}, but got {key!r}.")
+        for name in (found.key, *found.also):
+            kind, numbers = _kind(name)
+            bare = asked is not None and asked[0] == "" and kind not in ("example", "figure")
+            if asked is not None and asked[1] == numbers and (asked[0] == kind or bare):
+                fitting[kind] = found
+    if not fitting:
+        raise ValueError(f"Argument `key` must be one of {', '.join(map(repr, THESIS))}, but got {key!r}.")
+    return fitting.get("section") or next(iter(fitting.values()))
 
 
 def thesis(key: str, **parameters: Any) -> System:
