@@ -59,9 +59,9 @@ def find_orbit(
     result is moved away from events. The orbit's period, states and multipliers are differentiable with respect to the
     parameters of `system`, twice too, by implicit differentiation.
 
-    Where shooting does not converge from the guess, segments are tried, then segments in sixteen pieces, and then from
-    where the solution settles: unless `method` says which it is to be. (This needs concrete values: under `jit` or
-    `vmap` there is one try.)
+    Where shooting does not converge from the guess, segments are tried, whole and in sixteen pieces (unless `method`
+    is given; each is a program to be compiled); and then the same from where the solution settles. This needs concrete
+    values: under `jit` or `vmap` there is one try.
 
     **Arguments:**
 
@@ -189,19 +189,18 @@ def find_orbits(system: System, starts: Y, *, period: Any = None, order: int = 1
     return [orbit for _, orbit, _ in sorted(found, key=lambda entry: -entry[0])]
 
 
-def _points(orbit: Orbit, order: int) -> np.ndarray:
+def _points(orbit: Orbit, order: int) -> tuple[np.ndarray, float]:
     """States of which one is the base point of every orbit that is the same: those a period of the forcing apart, or
-    if there is none many along the way."""
-    number = order if orbit.system.period is not None else 512
-    ts = orbit.t0 + orbit.period * jnp.arange(number, dtype=orbit.t0.dtype) / number
-    return np.asarray(jax.vmap(ravel)(orbit.solve(saveat=dfx.SaveAt(ts=ts), throw=False).ys))
-
-
-def _same(known: Orbit, points: np.ndarray, orbit: Orbit) -> bool:
-    y = np.asarray(ravel(orbit.y0))
-    gap = np.linalg.norm(points - y, axis=1).min()
-    size = 1 + np.abs(points).max()
+    if there is none many along the way; and how far apart they lie."""
     if orbit.system.period is not None:
-        return bool(gap <= 1e-6 * size)
-    step = np.linalg.norm(np.diff(points, axis=0), axis=1).max()
-    return bool(abs(known.period - orbit.period) <= 1e-6 * known.period and gap <= step)
+        ts = orbit.t0 + orbit.period * jnp.arange(order, dtype=orbit.t0.dtype) / order
+        points = np.asarray(jax.vmap(ravel)(orbit.solve(saveat=dfx.SaveAt(ts=ts), throw=False).ys))
+        return points, 1e-6 * (1 + np.abs(points).max())
+    rows = np.asarray(jax.vmap(jax.vmap(ravel))(orbit.path().y))
+    return rows.reshape(-1, rows.shape[-1]), np.linalg.norm(np.diff(rows, axis=1), axis=-1).max()
+
+
+def _same(known: Orbit, along: tuple[np.ndarray, float], orbit: Orbit) -> bool:
+    points, apart = along
+    gap = np.linalg.norm(points - np.asarray(ravel(orbit.y0)), axis=1).min()
+    return bool(abs(known.period - orbit.period) <= 1e-6 * abs(known.period) and gap <= apart)

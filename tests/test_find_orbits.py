@@ -49,6 +49,14 @@ def test_symmetric():
     np.testing.assert_allclose(orbit.period, 2 * np.pi, atol=1e-10)
 
 
+@pytest.mark.slow
+def test_infinitely_unstable():
+    """Section 6.7 in backward time: one orbit, though its solutions from different base points leave it."""
+    x, v = jnp.linspace(0.7, 1.6, 8), jnp.linspace(-0.3, 0.1, 8)
+    orbits = find_orbits(gallery.thesis("6.7"), Motion(x, v), period=6.4, backward=True, **METHOD)
+    assert [len(orbits), *map(int, np.isinf(orbits[0].multipliers))] == [1, 1, 0]
+
+
 def test_none():
     far = Motion(jnp.array([0.01, 0.02]), jnp.array([0.0, 0.01]))
     assert find_orbits(Rings(), far, period=6.2, **METHOD) == []
