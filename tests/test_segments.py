@@ -256,7 +256,7 @@ class Saddle(nsjax.System):
         return 2 * jnp.pi
 
 
-@pytest.mark.parametrize("options", [dict(pieces=20), dict()])
+@pytest.mark.parametrize("options", [dict(pieces=20), pytest.param(dict(), marks=pytest.mark.slow)])
 def test_violently_unstable(options):
     """In pieces, which are tried too if nothing is said. The largest multiplier is 1.9e27, the smallest its reciprocal."""
     orbit = find_orbit(Saddle(), Motion(1.0, 0.0), **options, **METHOD)

@@ -47,7 +47,7 @@ def cases(system, reference, keys, slow):
 
 SHOTS = (
     *cases(Stop, orbit_reference.impact_orbit, orbit_reference.IMPACT, False),
-    *cases(gallery.ForcedStickSlip, orbit_reference.forced_stick_slip_orbit, orbit_reference.STICK_SLIP, False),
+    *cases(gallery.ForcedStickSlip, orbit_reference.forced_stick_slip_orbit, orbit_reference.STICK_SLIP, True),
     *cases(gallery.ForcedFriction, orbit_reference.friction_orbit, orbit_reference.FRICTION, True),
     *cases(gallery.Trilinear, orbit_reference.trilinear_orbit, orbit_reference.TRILINEAR, True),
 )
