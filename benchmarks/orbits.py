@@ -86,7 +86,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lanes", type=int, default=1000)
-    parser.add_argument("--scipy-lanes", type=int, default=5)
+    parser.add_argument("--scipy-lanes", type=int, default=20)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", help="where to write the numbers as JSON")
     args = parser.parse_args()
@@ -110,8 +110,10 @@ def main() -> None:
     start = time.perf_counter()
     periods = np.array([by_scipy(float(v), 1e-10) for v in few])
     seconds = (time.perf_counter() - start) / args.scipy_lanes
-    wrong = float(np.max(np.abs(periods - reference.stick_slip_period(few))))
-    rows.append(Row("scipy", args.scipy_lanes, 0.0, seconds * args.lanes, 1 / seconds, wrong))
+    wrong = np.abs(periods - reference.stick_slip_period(few))
+    found = wrong < 1e-6  # the others went astray
+    share, worst = float(np.mean(found)), float(np.max(wrong[found], initial=0.0))
+    rows.append(Row("scipy", round(share * args.lanes), 0.0, seconds * args.lanes, 1 / seconds, worst))
     print(line(rows[-1]))
     if args.out:
         with open(args.out, "w") as file:
