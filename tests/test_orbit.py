@@ -5,6 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 import reference
 from models import Motion, pid, Plane
@@ -306,6 +307,21 @@ def test_reverse_mode():
         jax.grad(lambda p: amplitude(p, dfx.ForwardMode()))(p)
     with pytest.raises(ValueError, match="`adjoint` must be `diffrax.ForwardMode"):
         amplitude(p, dfx.RecursiveCheckpointAdjoint())
+
+
+def test_fit_by_optimistix():
+    """Least squares need `jax.linearize`: damping and frequency from a state of the orbit."""
+    options = METHOD | dict(stepsize_controller=pid(1e-10), adjoint=dfx.DirectAdjoint(), throw=False)
+
+    def remainder(p, data):
+        orbit = find_orbit(Resonator(c=p[0], omega=p[1]), Motion(0.0, 0.0), **options)
+        return jnp.stack([*orbit.y0]) - data
+
+    true = jnp.array([0.2, 0.7])
+    data = remainder(true, jnp.zeros(2))
+    method = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
+    found = optx.least_squares(remainder, method, jnp.array([0.3, 0.6]), args=data, max_steps=30)
+    np.testing.assert_allclose(found.value, true, atol=1e-7)
 
 
 def test_derivative_where_there_is_no_orbit():
