@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from ._filippov import Model, State
 from ._floquet import eigenvalues
 from ._implicit import find_root
+from ._orbit import ravel
 from ._solution import RESULTS
 from ._system import frozen, impact, relay, System
 from ._types import Scalar, Y
@@ -132,10 +133,6 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, ma
         residual=error,
         result=RESULTS.where(good, RESULTS.successful, RESULTS.equilibrium_not_found),
     )
-
-
-def ravel(y: Y) -> Array:
-    return jfu.ravel_pytree(y)[0]
 
 
 def _state(model: Model, t: Scalar, y: Y, mode: tuple) -> State:

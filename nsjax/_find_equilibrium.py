@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._check import check_solve
-from ._equilibrium import Equilibrium, equilibrium_in, ravel
+from ._equilibrium import Equilibrium, equilibrium_in
 from ._filippov import Model
+from ._orbit import ravel
 from ._solution import raise_if, RESULTS
 from ._structure import is_constant
 from ._system import arrays_of, impact, sgn, System
