@@ -1,5 +1,7 @@
 """Equilibria: in a region, on surfaces that hold them, and virtual ones."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
@@ -72,6 +74,26 @@ class Equilibrium(eqx.Module):
         )
 
 
+def switch_values(model: Model, t: Scalar, state: State, sigma: Array) -> tuple[Any, ...]:
+    """The value of every switch, for those of the holdable ones."""
+    s = list(model.signs(t, state))
+    for i, k in enumerate(model.holdable):
+        s[k] = sigma[i]
+    return tuple(s)
+
+
+def balance(model: Model, t: Scalar, y: Y, sigma: Array, state: State) -> Float[Array, " equations"]:
+    """What vanishes at an equilibrium: the field; h on the surfaces that hold it, whose values are unknowns beside the
+    state, (2.19)-(2.20); and what the values of the others differ from their signs."""
+    rest = model.signs(t, state)
+    rows = [
+        jnp.where(model.held(k, state.mode[k]), _surface(model, k, t, y, state), sigma[i] - rest[k])
+        for i, k in enumerate(model.holdable)
+    ]
+    field = ravel(model.field(t, y, switch_values(model, t, state, sigma)))
+    return jnp.concatenate([field, jnp.stack(rows)]) if rows else field
+
+
 @eqx.filter_jit
 def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, max_iterations: int) -> Equilibrium:
     """Newton's method on f(y, s) = 0 in a given mode, with the values of the surfaces that hold the state as unknowns
@@ -80,24 +102,10 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, ma
     n = len(x0)
     model = Model(frozen(system), jnp.ones_like(t), t, y0)
     holdable = model.holdable
-    state = _state(model, t, y0, mode)
+    state = nearest_state(model, t, y0, mode)
 
-    def values(model: Model, sigma: Array) -> tuple:
-        s = list(model.signs(t, state))
-        for i, k in enumerate(holdable):
-            s[k] = sigma[i]
-        return tuple(s)
-
-    def residual(z: tuple, system: System) -> tuple:
-        x, sigma = z
-        model = Model(system, jnp.ones_like(t), t, y0)
-        y, rest = unravel(x), model.signs(t, state)
-        surface = [_surface(model, k, t, y, state) for k in holdable]
-        rows = [
-            jnp.where(model.held(k, state.mode[k]), h, sigma[i] - rest[k])
-            for i, (k, h) in enumerate(zip(holdable, surface))
-        ]
-        return ravel(model.field(t, y, values(model, sigma))), jnp.stack(rows) if rows else sigma
+    def residual(z: tuple, system: System) -> Array:
+        return balance(_with(model, system), t, unravel(z[0]), z[1], state)
 
     # Where a surface holds all along it, the values that keep it there are those of the nearest place.
     begin, signs = model.values(t, y0, state), model.signs(t, state)
@@ -105,19 +113,19 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, ma
     sigma = jnp.stack(sigma) if sigma else jnp.zeros(0, t.dtype)
     z, converged = find_root(residual, frozen((x0, sigma)), system, tol, max_iterations, well_posed=False)
     still = frozen(z)
-    error = jnp.max(jnp.abs(jnp.concatenate([r.ravel() for r in residual(still, frozen(system))])))
-    whole = jax.jacfwd(lambda z: jfu.ravel_pytree(residual(jfu.ravel_pytree(still)[1](z), frozen(system)))[0])
+    error = jnp.max(jnp.abs(residual(still, frozen(system))))
+    whole = jax.jacfwd(lambda z: residual(jfu.ravel_pytree(still)[1](z), frozen(system)))
     singular = jnp.linalg.svd(whole(jfu.ravel_pytree(still)[0]), compute_uv=False)
     isolated = singular[-1] > 1e-10 * singular[0]
 
-    live = Model(system, jnp.ones_like(t), t, y0)
-    y, s = unravel(z[0]), values(live, z[1])
-    jacobian = jax.jacfwd(lambda x: ravel(live.flow(t, unravel(x), state)))(z[0])
-    roots, held, attracts = _spectrum(live, t, y, state, s, jacobian)
+    live = _with(model, system)
+    y, s = unravel(z[0]), switch_values(live, t, state, z[1])
+    jacobian, motion, held, attracts = linear_motion(live, t, y, state, s)
+    free = jnp.arange(n, dtype=held.dtype) < n - held
+    roots = free_eigenvalues(motion, held)
     admissible, boundary = _place(model, t, frozen(y), state, frozen(s))
     size = 1 + jnp.max(jnp.abs(z[0]))
     good = converged & (error <= 1e3 * tol * size)
-    free = jnp.arange(n, dtype=held.dtype) < n - held
     return Equilibrium(
         system=system,
         y=y,
@@ -135,7 +143,11 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, ma
     )
 
 
-def _state(model: Model, t: Scalar, y: Y, mode: tuple) -> State:
+def _with(model: Model, system: System) -> Model:
+    return eqx.tree_at(lambda m: m.system, model, system)
+
+
+def nearest_state(model: Model, t: Scalar, y: Y, mode: tuple) -> State:
     """The mode, with the component of h nearest to zero where h < 0 or on it, and its least one elsewhere."""
     parts = []
     for k, switch in enumerate(model.switches):
@@ -149,16 +161,15 @@ def _surface(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
     return h[0 if state.part[k] is None else state.part[k]]
 
 
-def _spectrum(
-    model: Model, t: Scalar, y: Y, state: State, s: tuple, jacobian: Float[Array, "n n"]
-) -> tuple[Complex[Array, " n"], Int[Array, ""], Bool[Array, ""]]:
-    """The eigenvalues of the directions along the surfaces that hold the state, how many are taken, and whether these
-    surfaces attract (2.24)."""
-    n = len(jacobian)
+def linear_motion(
+    model: Model, t: Scalar, y: Y, state: State, s: tuple
+) -> tuple[Float[Array, "n n"], Float[Array, "n n"], Int[Array, ""], Bool[Array, ""]]:
+    """The Jacobian; the same with rates for the directions off the surfaces that hold the state which are far left of
+    all others; how many these are; and whether the surfaces attract (2.24)."""
+    x, unravel = jfu.ravel_pytree(y)
+    jacobian = jax.jacfwd(lambda x: ravel(model.flow(t, unravel(x), state)))(x)
     held, attracts = jnp.zeros((), jnp.int32), jnp.ones((), bool)
-    normals = []
-    unravel = jfu.ravel_pytree(y)[1]
-    x = ravel(y)
+    normals, taken = [], []
     for k in model.holdable:
         on = model.held(k, state.mode[k])
         contact = k in model.contacts
@@ -170,23 +181,24 @@ def _spectrum(
             slope = jax.jacfwd(lambda v, k=k: model.rates((k,), t, y, state, s[:k] + (v,) + s[k + 1 :])[0])(s[k])
             attracts = attracts & jnp.where(on, slope < 0, True)
         normals += [jnp.where(on, g / jnp.linalg.norm(g), 0) for g in gradients]
+        taken += [on] * len(gradients)
     if not normals:
-        return _ordered(eigenvalues(jacobian), n - held), held, attracts
-    # Off the surfaces every perturbation is given a rate that no other has, and told from them by its place.
-    q = jnp.linalg.svd(lax.stop_gradient(jnp.stack(normals)), full_matrices=True)[2]
-    along = jnp.arange(n, dtype=held.dtype) >= held
-    keep = jnp.outer(along, along)
-    turned = q @ jacobian @ q.T
-    far = -10 * (1 + jnp.max(jnp.abs(lax.stop_gradient(jacobian)))) * n
-    distinct = jnp.diag(jnp.where(along, 0, far * (1 + jnp.arange(n, dtype=x.dtype))))
-    return _ordered(eigenvalues(jnp.where(keep, turned, 0) + distinct), n - held), held, attracts
+        return jacobian, jacobian, held, attracts
+    # The normals N span a left invariant subspace, N J = T N: that is what being held means. So J - N⁺ (T + D) N has
+    # -D for T, and the other eigenvalues of J.
+    normal, on = jnp.stack(normals), jnp.stack(taken)
+    inverse = normal.T @ jnp.linalg.inv(normal @ normal.T + jnp.diag(jnp.where(on, 0, 1).astype(x.dtype)))
+    far = 10 * (1 + jnp.max(jnp.abs(lax.stop_gradient(jacobian)))) * len(x)
+    rates = jnp.diag(far * (1 + jnp.arange(len(normals), dtype=x.dtype)))
+    return jacobian, jacobian - inverse @ (normal @ jacobian @ inverse + rates) @ normal, held, attracts
 
 
-def _ordered(roots: Complex[Array, " n"], free: Array) -> Complex[Array, " n"]:
-    """Largest real part first; what is not free comes last, and is not a number."""
+def free_eigenvalues(motion: Float[Array, "n n"], held: Int[Array, ""]) -> Complex[Array, " n"]:
+    """Largest real part first; those off the surfaces come last, and are not numbers."""
+    roots = eigenvalues(motion)
     order = jnp.argsort(-lax.stop_gradient(roots).real)
-    index = jnp.arange(len(roots), dtype=jnp.int32)
-    return jnp.where(index < jnp.asarray(free, jnp.int32), roots[order], jnp.nan)
+    index = jnp.arange(len(roots), dtype=held.dtype)
+    return jnp.where(index < len(roots) - held, roots[order], jnp.nan)
 
 
 def _place(model: Model, t: Scalar, y: Y, state: State, s: tuple) -> tuple[Bool[Array, ""], Bool[Array, ""]]:

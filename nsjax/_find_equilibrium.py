@@ -55,7 +55,7 @@ def find_equilibrium(
 
     **Raises:** `ValueError` for a model that time enters; a runtime error if Newton's method does not converge.
     """
-    system, y0, t, given, tol = _checked(system, y0, t, mode, tol)
+    system, y0, t, given, tol = checked_equilibrium(system, y0, t, mode, tol)
     model = Model(system, jnp.ones_like(t), t, y0)
     names = [k.name for k in system.switches]
     chosen = tuple(given.get(n, m) for n, m in zip(names, _mode_of(model, t, y0)))
@@ -96,7 +96,7 @@ def find_equilibria(
     **Raises:** `ValueError` for more than 729 modes: give some by `mode`.
     """
     first = jax.tree.map(lambda x: jnp.asarray(x)[0], starts)
-    system, first, t, given, tol = _checked(system, first, t, mode, tol)
+    system, first, t, given, tol = checked_equilibrium(system, first, t, mode, tol)
     starts = jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), starts, first)
     model = Model(system, jnp.ones_like(t), t, first)
     found = _in_all_modes(system, model, t, starts, given, tol, max_iterations)
@@ -109,7 +109,7 @@ def find_equilibria(
     return distinct
 
 
-def _checked(system: System, y0: Y, t: Any, mode: Any, tol: float | None) -> tuple:
+def checked_equilibrium(system: System, y0: Y, t: Any, mode: Any, tol: float | None) -> tuple:
     y0, t, _, _, _, given = check_solve(system, t, t, y0, mode, dfx.Dopri8(), None, dfx.SaveAt(t1=True), 1, 1, None)
     system = arrays_of(system, t.dtype)
     values = system.values(tuple(jnp.zeros((), t.dtype) for _ in system.switches))

@@ -1,11 +1,9 @@
 """The generalized Jacobian of a non-smooth continuous field: what it is on each side of the surfaces at a point."""
 
-import dataclasses
 import itertools
 from typing import Any, NamedTuple
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -13,6 +11,7 @@ from jaxtyping import Array, Float
 
 from ._check import check_solve
 from ._filippov import Model
+from ._parameter import get_parameter, parameter_path, put_parameter
 from ._system import arrays_of, sgn, System
 from ._types import Y
 
@@ -72,9 +71,6 @@ def generalized_jacobian(
     """
     y, t, _, _, _, given = check_solve(system, t, t, y, mode, dfx.Dopri8(), None, dfx.SaveAt(t1=True), 1, 1, None)
     system = arrays_of(system, t.dtype)
-    names = [f.name for f in dataclasses.fields(system)]
-    if parameter is not None and parameter not in names:
-        raise ValueError(f"Argument `parameter` must be one of {', '.join(names)}, but got {parameter!r}.")
     small = (1e-9 if jnp.finfo(t.dtype).eps < 1e-10 else 1e-4) if tolerance is None else tolerance
     model = Model(system, jnp.ones_like(t), t, y)
     flat, unravel = jfu.ravel_pytree(y)
@@ -109,10 +105,11 @@ def generalized_jacobian(
     vertices = jnp.stack([jax.jacfwd(lambda x, s=s: field(system, x, s))(flat) for s in sides])
     by_parameter = None
     if parameter is not None:
-        value = getattr(system, parameter)
+        path = parameter_path(system, parameter)
 
         def moved(p: Array, s: tuple) -> Array:
-            return field(eqx.tree_at(lambda m: getattr(m, parameter), system, p), flat, s)
+            return field(put_parameter(system, path, p), flat, s)
 
-        by_parameter = jnp.stack([jax.jacfwd(moved)(value, s) for s in sides]).reshape(*shape, -1)
+        rows = [jax.jacfwd(moved)(get_parameter(system, path), s) for s in sides]
+        by_parameter = jnp.stack(rows).reshape(*shape, -1)
     return GeneralizedJacobian(surfaces, vertices.reshape(*shape, *vertices.shape[1:]), by_parameter)
