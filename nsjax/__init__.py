@@ -1,6 +1,9 @@
 """nsjax: differentiable piecewise-smooth dynamics in JAX."""
 
 from . import gallery as gallery, plot as plot
+from ._bifurcation import Bifurcation as Bifurcation, HalfBranch as HalfBranch
+from ._branch import Branch as Branch
+from ._continue_equilibrium import continue_equilibrium as continue_equilibrium
 from ._crossings import (
     eigenvalue_crossings as eigenvalue_crossings,
     eigenvalue_path as eigenvalue_path,
@@ -17,6 +20,7 @@ from ._generalized import (
     generalized_jacobian as generalized_jacobian,
     GeneralizedJacobian as GeneralizedJacobian,
 )
+from ._hopf_orbits import hopf_orbits as hopf_orbits
 from ._orbit import Orbit as Orbit
 from ._pencil import EigenvalueCrossing as EigenvalueCrossing
 from ._regularise import banded as banded, smoothed as smoothed

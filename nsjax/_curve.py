@@ -13,16 +13,16 @@ from ._implicit import find_root
 from ._pencil import bialternate
 
 
-# Test functions, before those of the guards. A curve leaves its interval at LOW and HIGH, and passes the parameter's value
-# at the start at MARK; FOLD is the parameter's part of the tangent, BRANCH the determinant of the equations bordered by the
-# tangent, PAIR a product of all sums of two eigenvalues.
+# Test functions, before those of the guards. A curve leaves its interval at LOW and HIGH, and passes the parameter's
+# value at the start at MARK; FOLD is the parameter's part of the tangent, BRANCH the determinant of the equations
+# bordered by the tangent, PAIR a product of all sums of two eigenvalues.
 LOW, HIGH, MARK, FOLD, BRANCH, PAIR, GUARDS = range(7)
 TOLERANCE = 1e-12
 
 
 class Curve(eqx.Module):
-    """Equations for unknowns `u`, in units in which lengths along the curve are measured. The last is the parameter, from
-    0 at the lower end of its interval to 1 at the upper one. In each of several modes they are smooth."""
+    """Equations for unknowns `u`, in units in which lengths along the curve are measured. The last is the parameter,
+    from 0 at the lower end of its interval to 1 at the upper one. In each of several modes they are smooth."""
 
     mark: eqx.AbstractVar[Float[Array, ""]]
 
@@ -125,8 +125,8 @@ class Place(NamedTuple):
 def locate(
     curve: Curve, step: Step, origin: Array, tangent: Array, ends: Array, mode: Array, which: Array, slope: Array
 ) -> Place:
-    """Where between the distances `ends` along `tangent` a test function, or its derivative, is zero: by bisection, which
-    needs no derivative of it, on the curve, whose equations are regular there."""
+    """Where between the distances `ends` along `tangent` a test function, or its derivative, is zero: by bisection,
+    which needs no derivative of it, on the curve, whose equations are regular there."""
     length = tangent @ (step.u - origin)
 
     def at(s: Array) -> tuple[Array, Array]:
@@ -174,8 +174,8 @@ def linearised(curve: Curve, u: Array, mode: Array) -> tuple[Array, Array]:
 
 @eqx.filter_jit
 def branching(curve: Curve, u: Array, kernel: Float[Array, "2 n+1"], left: Array, mode: Array) -> Float[Array, "2 2"]:
-    """ψᵀ D²F φ_i φ_j for the kernel φ_1, φ_2 of DF and ψ of its transpose: the branches through a simple branch point have
-    the directions a φ_1 + b φ_2 on which this vanishes; Keller (1977)."""
+    """ψᵀ D²F φ_i φ_j for the kernel φ_1, φ_2 of DF and ψ of its transpose: the branches through a simple branch point
+    have the directions a φ_1 + b φ_2 on which this vanishes; Keller (1977)."""
 
     def along(a: Array, b: Array) -> Array:
         return left @ curve.residual(u + a * kernel[0] + b * kernel[1], mode)

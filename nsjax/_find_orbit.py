@@ -178,9 +178,14 @@ def find_orbits(system: System, starts: Y, *, period: Any = None, order: int = 1
 
     batch = sweep(one, (starts, guesses))
     arrays, static = eqx.partition(batch, eqx.is_array)
+    good = np.flatnonzero(np.asarray(is_okay(batch.result)))
+    return distinct_orbits([eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static) for i in good], order)
+
+
+def distinct_orbits(orbits: Sequence[Orbit], order: int = 1) -> list[Orbit]:
+    """Each once, those first that are there most often."""
     found: list[list[Any]] = []
-    for i in np.flatnonzero(np.asarray(is_okay(batch.result))):
-        orbit = eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static)
+    for orbit in orbits:
         known = next((entry for entry in found if _same(entry[1], entry[2], orbit)), None)
         if known is None:
             found.append([1, orbit, _points(orbit, order)])

@@ -89,7 +89,7 @@ def _spectrum(a: np.ndarray, b: np.ndarray, q: float, circle: bool) -> _Spectrum
         return _Spectrum(values, side, slope, bend, doubt, first)
 
 
-def _bialternate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def bialternate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The bialternate product A ⊙ B. Sums of two eigenvalues of A are the eigenvalues of 2 A ⊙ I, their products those
     of A ⊙ A (half the Kronecker sum and product, without what is there twice); Guckenheimer, Myers & Sturmfels (1997).
     """
@@ -106,8 +106,8 @@ def _pencils(a: np.ndarray, b: np.ndarray, circle: bool) -> list[tuple[complex |
     first, or (at None) where a pair may be on the axis or circle."""
     eye = np.eye(len(a))
     if not circle:
-        return [(0j, [a, b]), (None, [2 * _bialternate(a, eye), 2 * _bialternate(b, eye)])]
-    products = [_bialternate(a, a) - np.eye(len(a) * (len(a) - 1) // 2), 2 * _bialternate(a, b), _bialternate(b, b)]
+        return [(0j, [a, b]), (None, [2 * bialternate(a, eye), 2 * bialternate(b, eye)])]
+    products = [bialternate(a, a) - np.eye(len(a) * (len(a) - 1) // 2), 2 * bialternate(a, b), bialternate(b, b)]
     return [(1 + 0j, [a - eye, b]), (-1 + 0j, [a + eye, b]), (None, products)]
 
 
