@@ -21,6 +21,7 @@ from ._generalized import (
     GeneralizedJacobian as GeneralizedJacobian,
 )
 from ._hopf_orbits import hopf_orbits as hopf_orbits
+from ._kinks import mark_kinks as mark_kinks
 from ._orbit import Orbit as Orbit
 from ._pencil import EigenvalueCrossing as EigenvalueCrossing
 from ._regularise import banded as banded, smoothed as smoothed

@@ -95,14 +95,15 @@ class Bifurcation(NamedTuple):
         words = ["discontinuous"] * self.discontinuous + [self.kind, "bifurcation"]
         return " ".join(words) + (f", {self.criticality}" if self.criticality else "")
 
-    def with_orbits(self, below: Sequence[Any], above: Sequence[Any]) -> "Bifurcation":
+    def with_orbits(self, below: Sequence[Sequence[Any]], above: Sequence[Sequence[Any]]) -> "Bifurcation":
         """The same, with the count of periodic orbits that `hopf_orbits` finds for further evidence (Definition 5.1). A
         Hopf bifurcation is supercritical where they attract, subcritical where they repel."""
         if "Hopf" not in self.kind or len(below) == len(above) == 0:
             return self
         criticality = self.criticality
-        if self.kind == "Hopf" and len({bool(orbit.stable) for orbit in [*below, *above]}) == 1:
-            criticality = "supercritical" if (*below, *above)[0].stable else "subcritical"
+        stable = {bool(family[0].stable) for family in [*below, *above]}
+        if self.kind == "Hopf" and len(stable) == 1:
+            criticality = "supercritical" if stable.pop() else "subcritical"
         evidence = "both" if self.by_count == "none" else self.evidence
         return self._replace(orbits=(len(below), len(above)), evidence=evidence, criticality=criticality)
 
@@ -122,6 +123,13 @@ class Bifurcation(NamedTuple):
         if self.period is not None:
             lines.append(f"  period     {self.period:.12g}")
         return "\n".join(lines)
+
+
+def unstable_number(roots: Any) -> Any:
+    """How many eigenvalues have positive real parts, beyond rounding; over the last axis."""
+    roots = np.asarray(roots)
+    size = np.nanmax(np.abs(roots), axis=-1, keepdims=True, initial=1e-300)
+    return np.sum(np.real(roots) > 1e-10 * size, axis=-1)
 
 
 def _plain(x: float) -> str:

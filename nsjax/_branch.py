@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._bifurcation import Bifurcation, NOT_BIFURCATIONS
+from ._bifurcation import Bifurcation, NOT_BIFURCATIONS, unstable_number
 from ._equilibrium_curve import Record
 from ._system import System
 from ._types import Y
@@ -132,7 +132,7 @@ def branch_of(system: System, parameter: str, back: Strand, ahead: Strand) -> Br
         modes=np.stack([mode[0] for mode in strand.modes]),
         multipliers=tree.multipliers,
         eigenvalues=tree.eigenvalues,
-        unstable=np.sum(tree.eigenvalues.real > 0, axis=1),
+        unstable=unstable_number(tree.eigenvalues),
         stable=tree.stable,
         special=tuple(b for _, b in strand.special),
         indices=tuple(i for i, _ in strand.special),

@@ -22,6 +22,10 @@ from ._trace import Tracer
 from ._types import Y
 
 
+ALONE = (
+    "Argument `start` must be an isolated equilibrium, or a simple branch point, but there are others next to it at "
+    "the same value of the parameter (as sticking friction makes them)."
+)
 NOTHING = 1e-11  # a state below it is what Newton's method leaves of zero
 
 
@@ -156,7 +160,7 @@ class _Tree:
                 self.set_out(u, mode)
             self.follow_all()
         if not self.found:
-            raise ValueError("Argument `start` must lie on a branch, but no equilibrium is next to it.")
+            raise ValueError(ALONE)
         first, *others = self.found
         return dataclasses.replace(first, others=tuple(others))
 
@@ -172,10 +176,7 @@ class _Tree:
                 self.nodes.append(node_at(curve, self.tracer.name, u, mode))
             return
         if len(tangents) != 2:
-            raise ValueError(
-                "Argument `start` must be an isolated equilibrium, or a simple branch point, but there are others next "
-                "to it at the same value of the parameter."
-            )
+            raise ValueError(ALONE)
         tangent = jnp.asarray(max(tangents, key=lambda d: d[-1]))  # upwards first
         self.tracer.begin = (u, tangent, mode)
         strand = Strand()
@@ -207,7 +208,8 @@ class _Tree:
         half.used = True
         strand = Strand()
         self.depart(strand, half)
-        strand.note(node.bifurcation)
+        if node.bifurcation.kind != "none" or node.bifurcation.discontinuous:
+            strand.note(node.bifurcation)
         return self.walk(strand, *_outset(half))
 
     def depart(self, strand: Strand, half: Half) -> None:
@@ -229,7 +231,8 @@ class _Tree:
             if node is None:
                 node = node_at(curve, self.tracer.name, u, mode, tangent)
                 self.nodes.append(node)
-            strand.note(node.bifurcation)
+            if node.bifurcation.kind != "none" or node.bifurcation.discontinuous:
+                strand.note(node.bifurcation)
             arrived = matching(node.halves, mode, -tangent)
             ahead = None if arrived is None else arrived.partner
             if arrived is not None:

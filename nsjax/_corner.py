@@ -7,15 +7,16 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 
-from ._bifurcation import Bifurcation, classified, counted, HalfBranch, odd_one
+from ._bifurcation import Bifurcation, classified, counted, HalfBranch, odd_one, unstable_number
 from ._crossings import eigenvalue_crossings
-from ._curve import advance, branching, kept, linearised, near, Step
+from ._curve import advance, branching, kept, linearised, near, row_sizes, Step
 from ._equilibrium_curve import EITHER, EquilibriumCurve, first_lyapunov_coefficient
 from ._pencil import EigenvalueCrossing
 
 
 ACTIVE = 1e-8  # distance at which a point lies on a surface: it is located to some 1e-12
-SINGULAR = 1e-8  # relative to the largest singular value
+NEAR = 3e-8  # distance within which two points are one
+SINGULAR = 1e-8  # relative to the largest singular value, and to what the equations are elsewhere
 PROBE = 1e-4  # length of the step by which a half-branch is tried: nothing is read off it but signs
 CONTINUUM = 1e-12  # change of the parameter in such a step that is none
 MODES = 6561  # so many combinations of sides are tried
@@ -48,7 +49,7 @@ class Node:
     def is_at(self, curve: EquilibriumCurve, u: Any) -> bool:
         here, there = curve.parts(self.u), curve.parts(u)
         x = jnp.abs(here[0] - there[0]) / curve.units[: len(here[0])]
-        return bool((jnp.max(x) < 1e-6) & (jnp.abs(here[2] - there[2]) / curve.units[-1] < 1e-6))
+        return bool((jnp.max(x) < NEAR) & (jnp.abs(here[2] - there[2]) / curve.units[-1] < NEAR))
 
 
 def active(curve: EquilibriumCurve, u: Any, mode: np.ndarray) -> np.ndarray:
@@ -59,10 +60,9 @@ def active(curve: EquilibriumCurve, u: Any, mode: np.ndarray) -> np.ndarray:
 def kernel(curve: EquilibriumCurve, u: Any, mode: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
     """The null space of DF, the left singular vector that belongs to it if it has two dimensions, and whether F = 0."""
     f, df = (np.asarray(x) for x in linearised(curve, u, jnp.asarray(mode)))
-    rows = np.abs(df).max(axis=1)
-    rows = np.where(rows == 0, 1, rows)
+    rows = np.asarray(row_sizes(curve, u, jnp.asarray(mode)))
     left, sizes, right = np.linalg.svd(df / rows[:, None])
-    rank = int(np.sum(sizes > SINGULAR * max(sizes[0], 1e-300)))
+    rank = int(np.sum(sizes > SINGULAR))
     return right[rank:], left[:, -1] / rows, bool(np.all(np.abs(f) <= 1e-7 * rows))
 
 
@@ -98,20 +98,26 @@ def _half(
     step = advance(curve, u, direction, jnp.asarray(length), mode_array)
     if not step.good:
         return None
+    if abs(float(step.u[-1] - u[-1])) <= CONTINUUM and length < 1e-2:
+        longer = _half(curve, u, mode, tangent, regular, 10 * length)
+        if longer is not None and longer.side:
+            return longer
     there = np.asarray(near(curve, step.u))
     # In a surface along which the field has a kink both sides have the branch, and the first is taken.
     if np.any(matters & (np.abs(here) <= ACTIVE) & (signs * there < -1e-11)):
         return None
     move = float(step.u[-1] - u[-1])
     slopes = np.asarray(linearised(curve, step.u, mode_array)[1])[:, :-1]
+    # Not the tangent itself: a field may have kinks that no switch tells of on this very surface.
+    secant = (step.u - u) / jnp.linalg.norm(step.u - u)
     return Half(
         u=u,
-        tangent=direction,
+        tangent=secant,
         mode=mode,
         step=step,
         regular=regular,
         side=0 if abs(move) <= CONTINUUM else int(np.sign(move)),
-        unstable=int(jnp.sum(step.record.eigenvalues.real > 0)),
+        unstable=int(unstable_number(step.record.eigenvalues)),
         index=int(np.linalg.slogdet(slopes)[0]),
     )
 
@@ -141,12 +147,27 @@ def node_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, arrivi
                 halves.append(half)
     if arriving is not None and matching(halves, mode, -arriving) is None:
         half = _half(curve, u, mode, -np.asarray(arriving), not degenerate)
-        halves += [half] if half is not None else []
+        halves += [half] if half is not None and not any(_same(curve, half, known) for known in halves) else []
     if degenerate and arriving is not None and not surfaces:
         half = _half(curve, u, mode, np.asarray(arriving), False)
         halves += [half] if half is not None else []
+    left = _left(curve, halves)
     first = _partners(halves)
-    return Node(u, halves, _described(curve, name, u, halves, first, tuple(surfaces), continuous))
+    met = tuple(k for k in surfaces if k in left) if halves else tuple(surfaces)
+    bifurcation = _described(curve, name, u, halves, first, met, continuous)
+    if degenerate and not met:
+        bifurcation = bifurcation._replace(kind="degenerate branch point", by_crossing=("branch point",))
+    return Node(u, halves, bifurcation)
+
+
+def _left(curve: EquilibriumCurve, halves: list[Half]) -> set[str]:
+    """The switches whose surfaces (or bounds) some half-branch leaves, instead of running along it."""
+    names = [k.name for k in curve.model.switches]
+    left = set()
+    for half in halves:
+        away = np.abs(np.asarray(near(curve, half.step.u))) > 1e-11
+        left |= {names[k] for (k, _, _), on, far in zip(curve.slots(), curve.armed(half.mode), away) if on and far}
+    return left
 
 
 def _same(curve: EquilibriumCurve, a: Half, b: Half) -> bool:
@@ -226,9 +247,11 @@ def _described(
     )
 
 
-def fold_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, tangent: Any) -> Bifurcation:
+def fold_at(
+    curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, tangent: Any, length: float = 10 * PROBE
+) -> Bifurcation:
     """A point at which the branch is vertical: whether it turns back is seen a step further on either side."""
-    both = [_half(curve, u, mode, way * tangent, True, 10 * PROBE) for way in (-1, 1)]
+    both = [_half(curve, u, mode, way * tangent, True, min(10 * PROBE, length)) for way in (-1, 1)]
     found = _described(curve, name, u, [half for half in both if half is not None], None, (), True)
     return (
         found._replace(kind="hysteresis point", by_crossing=("saddle-node", "saddle-node"), evidence="count")
@@ -237,8 +260,11 @@ def fold_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, tangen
     )
 
 
-def hopf_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, tangent: Any) -> Bifurcation | None:
-    """A point at which two eigenvalues cancel; None for a neutral saddle, whose eigenvalues are real."""
+def hopf_at(
+    curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, tangent: Any, length: float = PROBE
+) -> Bifurcation | None:
+    """A point at which two eigenvalues cancel, or several pairs do; None for a neutral saddle, whose eigenvalues are
+    real, and where none of them changes sides, as in a conservative system."""
     record = kept(curve, u, jnp.asarray(mode))
     roots = np.asarray(record.eigenvalues)
     roots = roots[np.isfinite(roots)]
@@ -247,16 +273,21 @@ def hopf_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, tangen
     omega = abs(roots[i].imag)
     if abs(roots[i].real) > 1e-6 * omega or roots[i].imag * roots[j].imag >= 0:
         return None
-    both = [_half(curve, u, mode, way * tangent, True) for way in (-1, 1)]
-    found = _described(curve, name, u, [half for half in both if half is not None], None, (), True)
+    both = [_half(curve, u, mode, way * tangent, True, min(PROBE, length)) for way in (-1, 1)]
+    halves = [half for half in both if half is not None]
+    pairs = abs(halves[0].unstable - halves[1].unstable) // 2 if len(halves) == 2 else 1
+    if not pairs:
+        return None
+    found = _described(curve, name, u, halves, None, (), True)
     # On a surface that holds the state the plane of the pair is not that of the coordinates.
     held = int(record.held) > 0
     coefficient = 0.0 if held else float(first_lyapunov_coefficient(curve, u, jnp.asarray(mode)))
     criticality = None if abs(coefficient) < 1e-9 else "supercritical" if coefficient < 0 else "subcritical"
-    kind, evidence = classified(found.by_count, ("Hopf",))
-    return found._replace(
-        kind=kind, evidence=evidence, by_crossing=("Hopf",), criticality=criticality, period=float(2 * np.pi / omega)
-    )
+    criticality = criticality if pairs == 1 else None
+    by_crossing = ("Hopf",) * pairs
+    kind, evidence = classified(found.by_count, by_crossing)
+    known = dict(kind=kind, evidence=evidence, by_crossing=by_crossing, criticality=criticality)
+    return found._replace(**known, period=float(2 * np.pi / omega))
 
 
 def start_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, tangent: Any) -> Bifurcation | None:

@@ -61,11 +61,11 @@ class Step(NamedTuple):
     good: Bool[Array, ""]
 
 
-def _bordered(curve: Curve, u: Array, border: Array, mode: Array) -> tuple[Array, Array]:
-    """The unit tangent that points along `border`, and the determinant."""
+def _tangent(curve: Curve, u: Array, border: Array, mode: Array) -> Array:
+    """Of length one, and along `border`."""
     whole = jnp.concatenate([jax.jacfwd(curve.residual)(u, mode), border[None]])
     tangent = jnp.linalg.solve(whole, jnp.zeros_like(u).at[-1].set(1))
-    return tangent / jnp.linalg.norm(tangent), jnp.linalg.det(whole)
+    return tangent / jnp.linalg.norm(tangent)
 
 
 def distances(curve: Curve, u: Array) -> Array:
@@ -74,18 +74,32 @@ def distances(curve: Curve, u: Array) -> Array:
     return curve.guards(u) / jnp.where(gradients == 0, 1, gradients)
 
 
-def _tests(curve: Curve, u: Array, border: Array, mode: Array) -> Array:
-    tangent, determinant = _bordered(curve, u, border, mode)
+def _determinants(curve: Curve, u: Array, border: Array, mode: Array) -> tuple[Array, Array]:
+    """Signs and logarithms of those for branch points and for pairs, which may be out of range themselves."""
     motion = curve.motion(u, mode)
     sums = 2 * bialternate(motion, jnp.eye(len(motion), dtype=u.dtype))
-    pair = jnp.linalg.det(sums) if len(motion) > 1 else jnp.ones((), u.dtype)
-    first = jnp.stack([u[-1], 1 - u[-1], u[-1] - curve.mark, tangent[-1], determinant, pair])
-    return jnp.concatenate([first, distances(curve, u)])
+    whole = jnp.concatenate([jax.jacfwd(curve.residual)(u, mode), border[None]])
+    pairs = jnp.linalg.slogdet(sums) if len(motion) > 1 else (jnp.ones((), u.dtype), jnp.zeros((), u.dtype))
+    signs, logs = zip(jnp.linalg.slogdet(whole), pairs)
+    return jnp.stack(signs), jnp.stack(logs)
 
 
-def _probe(curve: Curve, u: Array, border: Array, mode: Array) -> Probe:
-    tangent, _ = _bordered(curve, u, border, mode)
-    return Probe(*jax.jvp(lambda u: _tests(curve, u, border, mode), (u,), (tangent,)))
+def _scale(curve: Curve, origin: Array, border: Array, mode: Array) -> Array:
+    """What determinants are divided by along a step."""
+    logs = _determinants(curve, origin, border, mode)[1]
+    return jnp.where(jnp.isfinite(logs), logs, 0)
+
+
+def _tests(curve: Curve, u: Array, border: Array, mode: Array, scale: Array) -> Array:
+    tangent = _tangent(curve, u, border, mode)
+    signs, logs = _determinants(curve, u, border, mode)
+    first = jnp.stack([u[-1], 1 - u[-1], u[-1] - curve.mark, tangent[-1]])
+    return jnp.concatenate([first, signs * jnp.exp(logs - scale), distances(curve, u)])
+
+
+def _probe(curve: Curve, u: Array, border: Array, mode: Array, scale: Array) -> Probe:
+    tangent = _tangent(curve, u, border, mode)
+    return Probe(*jax.jvp(lambda u: _tests(curve, u, border, mode, scale), (u,), (tangent,)))
 
 
 def _corrected(curve: Curve, origin: Array, tangent: Array, s: Array, guess: Array, mode: Array) -> tuple[Array, Array]:
@@ -105,14 +119,14 @@ def _corrected(curve: Curve, origin: Array, tangent: Array, s: Array, guess: Arr
 def advance(curve: Curve, u: Array, tangent: Array, s: Array, mode: Array) -> Step:
     """One step of length `s` along the curve."""
     end, good = _corrected(curve, u, tangent, s, u + s * tangent, mode)
-    ahead, _ = _bordered(curve, end, tangent, mode)
-    here, there = _probe(curve, u, tangent, mode), _probe(curve, end, tangent, mode)
+    ahead, scale = _tangent(curve, end, tangent, mode), _scale(curve, u, tangent, mode)
+    here, there = _probe(curve, u, tangent, mode, scale), _probe(curve, end, tangent, mode, scale)
     good = good & jnp.all(jnp.isfinite(ahead)) & jnp.all(jnp.isfinite(there.values))
     return Step(end, ahead, here, there, curve.record(end, mode), good)
 
 
 class Place(NamedTuple):
-    """A point found on the curve."""
+    """A point found on the curve, and the tangent just before it."""
 
     s: Float[Array, ""]
     u: Float[Array, " n+1"]
@@ -127,13 +141,13 @@ def locate(
 ) -> Place:
     """Where between the distances `ends` along `tangent` a test function, or its derivative, is zero: by bisection,
     which needs no derivative of it, on the curve, whose equations are regular there."""
-    length = tangent @ (step.u - origin)
+    length, scale = tangent @ (step.u - origin), _scale(curve, origin, tangent, mode)
 
     def at(s: Array) -> tuple[Array, Array]:
         return _corrected(curve, origin, tangent, s, origin + s / length * (step.u - origin), mode)
 
     def value(s: Array) -> Array:
-        probe = _probe(curve, at(s)[0], tangent, mode)
+        probe = _probe(curve, at(s)[0], tangent, mode, scale)
         return jnp.where(slope, probe.slopes[which], probe.values[which])
 
     sign = jnp.where(value(ends[1]) < 0, -1.0, 1.0).astype(origin.dtype)
@@ -146,9 +160,15 @@ def locate(
         max_steps=70,
         throw=False,
     )
-    u, good = at(found.value)
-    probe = _probe(curve, u, tangent, mode)
-    return Place(found.value, u, _bordered(curve, u, tangent, mode)[0], probe.values[which], good)
+    # Where the equations are singular exactly, a place beside it is known.
+    exact = at(found.value)[0]
+    beside = found.value - 1e-7 * (ends[1] - ends[0])
+    s = jnp.where(jnp.all(jnp.isfinite(exact)), found.value, beside)
+    u, good = at(s)
+    probe = _probe(curve, u, tangent, mode, scale)
+    # The tangent with which it is reached: on the surface itself a field may have a kink that no switch tells of.
+    arriving = _tangent(curve, at(s * (1 - 1e-6))[0], tangent, mode)
+    return Place(s, u, arriving, probe.values[which], good)
 
 
 @eqx.filter_jit
@@ -170,6 +190,14 @@ def branch_point(curve: Curve, u: Array, mode: Array) -> tuple[Array, Bool[Array
 def linearised(curve: Curve, u: Array, mode: Array) -> tuple[Array, Array]:
     """F and DF."""
     return curve.residual(u, mode), jax.jacfwd(curve.residual)(u, mode)
+
+
+@eqx.filter_jit
+def row_sizes(curve: Curve, u: Array, mode: Array) -> Array:
+    """Of the rows of DF: what they have, or would have a unit further on, where all of a row vanishes here."""
+    first = jax.jacfwd(curve.residual)
+    size = jnp.max(jnp.abs(first(u, mode)), axis=1) + jnp.max(jnp.abs(jax.jacfwd(first)(u, mode)), axis=(1, 2))
+    return jnp.where(size > 0, size, 1)
 
 
 @eqx.filter_jit

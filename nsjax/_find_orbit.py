@@ -138,7 +138,7 @@ def find_orbit(
     if order is None and not autonomous and not concrete:
         raise ValueError("Argument `order` must be given under `jit` and `vmap`: finding it out needs concrete values.")
     newton = dict(tol=tol, max_iterations=max_iterations)
-    search = Search(t0, order, given, method, symmetry, backward, segments, pieces, concrete, how, newton)
+    search = Search(t0, order, given or None, method, symmetry, backward, segments, pieces, concrete, how, newton)
     if isinstance(adjoint, dfx.DirectAdjoint) and not concrete:
         orbit = dense_jacobian(search.run, system, y0, period)
     else:

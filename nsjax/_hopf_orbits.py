@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -11,24 +12,27 @@ from ._bifurcation import Bifurcation
 from ._equilibrium import Equilibrium
 from ._find_equilibrium import find_equilibrium
 from ._find_orbit import distinct_orbits, find_orbit
-from ._orbit import Orbit
+from ._orbit import Orbit, ravel
 from ._parameter import parameter_path, put_parameter
 from ._solution import is_okay
-from ._system import System
+from ._system import arrays_of, System
+
+
+Families = list[list[Orbit]]
 
 
 def hopf_orbits(
     system: System, bifurcation: Bifurcation, distance: Any, *, sizes: Any = None, **options: Any
-) -> tuple[list[Orbit], list[Orbit]]:
-    """The periodic orbits below and above a Hopf bifurcation: the first ones of the branches that are born there.
+) -> tuple[Families, Families]:
+    """The periodic orbits that are born at a Hopf bifurcation, below it and above it: the first ones of their branches.
 
-    Where the equilibrium repels, what leaves it is followed to where it settles; else `find_orbit` starts from states
-    at several distances, in the plane of the pair of eigenvalues. `Bifurcation.with_orbits` takes what is found for
-    evidence.
+    `find_orbit` starts by shooting from states at several distances to the equilibrium, in the plane of its least
+    damped pair of eigenvalues. `Bifurcation.with_orbits` takes what is found for evidence, and
+    `plot.bifurcation_diagram` draws it.
 
     ```python
     (hopf,) = [b for b in branch.bifurcations if "Hopf" in b.kind]
-    below, above = nsjax.hopf_orbits(system, hopf, 0.1)
+    below, above = nsjax.hopf_orbits(system, hopf, [0.1, 0.2, 0.4])
     print(hopf.with_orbits(below, above))
     ```
 
@@ -36,27 +40,48 @@ def hopf_orbits(
 
     - `system`: the model; its value of the parameter does not matter.
     - `bifurcation`: from a `Branch`.
-    - `distance`: of the parameter from its value there, to either side.
-    - `sizes`: distances from the equilibrium to start from; by default nine from 0.03 to 3 times `distance`, which the
-        orbits of a discontinuous bifurcation grow in proportion to, or its root, at a smooth one.
+    - `distance`: of the parameter from its value there, to either side; or several, the orbits for each being found
+        from those for the one before.
+    - `sizes`: distances from the equilibrium to start from; by default nine from 0.03 to 3 times the first
+        `distance`, which the orbits of a discontinuous bifurcation grow in proportion to, or its root, at a smooth one.
     - `options`: as for `find_orbit`.
 
-    **Returns:** two lists of orbits.
+    **Returns:** two lists of families of orbits, each with one orbit for every distance (up to where it is lost).
 
     **Raises:** `ValueError` for a point that is no Hopf bifurcation.
     """
     if bifurcation.period is None:
         raise ValueError(f"Argument `bifurcation` must be a Hopf bifurcation, but is: {bifurcation.name}.")
+    distances = np.atleast_1d(np.asarray(distance, float))
+    if np.any(distances <= 0):
+        raise ValueError(f"Argument `distance` must be positive, as both sides are looked at, but got {distance}.")
     path = parameter_path(system, bifurcation.parameter)
-    if sizes is None:
-        sizes = np.geomspace(0.03, 3, 9) * (distance if bifurcation.discontinuous else np.sqrt(distance))
-    found = []
-    for side in (-1, 1):
-        value = bifurcation.value + side * float(distance)
-        beside = put_parameter(system, path, value)
-        at = find_equilibrium(beside, _guess(bifurcation, side, float(distance)))
-        found.append(_around(beside, at, bifurcation.period, np.asarray(sizes), options))
-    return found[0], found[1]
+    power = 1.0 if bifurcation.discontinuous else 0.5
+    sizes = np.geomspace(0.03, 3, 9) * distances[0] ** power if sizes is None else np.asarray(sizes)
+
+    def beside(side: int, distance: float) -> tuple[System, Equilibrium]:
+        model = put_parameter(system, path, bifurcation.value + side * distance)
+        return model, find_equilibrium(model, _guess(bifurcation, side, distance))
+
+    found: tuple[Families, Families] = ([], [])
+    for side, families in zip((-1, 1), found):
+        model, at = beside(side, distances[0])
+        families += [[orbit] for orbit in _around(model, at, bifurcation.period, sizes, options)]
+        for last, distance in zip(distances[:-1], distances[1:]):
+            model, there = beside(side, distance)
+            for family in (family for family in families if last == distances[0] or len(family) > 1):
+                orbit = family[-1]
+                grown = ravel(there.y) + (distance / last) ** power * (ravel(orbit.y0) - ravel(at.y))
+                orbit = _found(model, jfu.ravel_pytree(at.y)[1](grown), orbit.period, options)
+                family += [orbit] if is_okay(orbit.result) else []
+            at = there
+    return found
+
+
+@eqx.filter_jit
+def _found(system: System, y: Any, period: Any, options: dict[str, Any]) -> Orbit:
+    """One try, in one program for all."""
+    return find_orbit(system, y, period=period, **({"method": "shooting"} | options | {"throw": False}))
 
 
 def _guess(bifurcation: Bifurcation, side: int, distance: float) -> Any:
@@ -72,20 +97,12 @@ def _guess(bifurcation: Bifurcation, side: int, distance: float) -> Any:
 def _around(system: System, at: Equilibrium, period: float, sizes: np.ndarray, options: dict[str, Any]) -> list[Orbit]:
     x, unravel = jfu.ravel_pytree(at.y)
     roots, vectors = np.linalg.eig(np.asarray(at.jacobian))
-    pairs = [i for i in range(len(roots)) if roots[i].imag > 0]
     plane = np.eye(len(x))[0]
+    pairs = [i for i in range(len(roots)) if np.imag(roots[i]) > 0]
     if pairs:
         pair = min(pairs, key=lambda i: abs(np.real(roots[i])))
-        period, plane = 2 * np.pi / roots[pair].imag, np.real(vectors[:, pair])
+        period, plane = 2 * np.pi / np.imag(roots[pair]), np.real(vectors[:, pair])
         plane = plane / np.linalg.norm(plane)
-    tries: list[dict[str, Any]] = [dict(size=size, period=period) for size in sizes]
-    if np.any(np.real(roots) > 0):
-        tries.insert(0, dict(size=sizes[0], period=None))
-    found = []
-    for one in tries:
-        y = unravel(x + one["size"] * jnp.asarray(plane))
-        orbit = find_orbit(system, y, period=one["period"], **({"method": "shooting", "throw": False} | options))
-        found += [orbit] if is_okay(orbit.result) else []
-        if found and one["period"] is None:
-            break  # what attracts
-    return distinct_orbits(found)
+    system, guess = arrays_of(system, x.dtype), jnp.asarray(period, x.dtype)
+    found = [_found(system, unravel(x + size * jnp.asarray(plane)), guess, options) for size in sizes]
+    return distinct_orbits([orbit for orbit in found if is_okay(orbit.result)])

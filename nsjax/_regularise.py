@@ -17,9 +17,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._check import check_model, check_system
 from ._filippov import Model, State
-from ._system import AbstractSwitch, forwarded, frozen, sgn, SwitchValues, System
+from ._series import Series
+from ._structure import is_constant
+from ._system import AbstractSwitch, arrays_of, forwarded, frozen, sgn, SwitchValues, System
 from ._types import Scalar, Y
 
+
+_TERMS = 8  # of the series in `_quotient`
 
 _CURVES: dict[str, Callable[[Scalar], Scalar]] = {
     "arctan": lambda x: 2 / jnp.pi * jnp.arctan(x),
@@ -39,6 +43,10 @@ def _pulled(switch: sgn) -> sgn:
         return tuple(h * growth for h in switch.components(self.system, t, y))
 
     return forwarded(switch)._with(guard=guard)
+
+
+def _height(switch: AbstractSwitch, system: System, t: Scalar, y: Y) -> Scalar:
+    return ft.reduce(jnp.minimum, switch.components(system, t, y))
 
 
 def _field(system: System, t: Scalar, y: Y, friction: _Values, others: _Values) -> Y:
@@ -74,11 +82,105 @@ class Smoothed(_Regularised):
     system: System
     eps: Float[Array, ""] | float
     kind: str = eqx.field(static=True)
+    offset: dict[str, Float[Array, ""] | float] = eqx.field(default_factory=dict)
 
-    def put(self, t: Scalar, y: Y, s: SwitchValues) -> _Values:
+    def put(self, t: Scalar, y: Y, s: SwitchValues) -> dict[str, Any]:
         frictions = [k for k in self.system.switches if isinstance(k, sgn)]
-        heights = {k.name: ft.reduce(jnp.minimum, k.components(self.system, t, y)) for k in frictions}
-        return {name: _CURVES[self.kind](self.eps * h) for name, h in heights.items()}
+        return {k.name: _CURVES[self.kind](self.eps * _height(k, self.system, t, y)) for k in frictions}
+
+    def vector_field(self, t: Scalar, y: Y, s: SwitchValues) -> Y:
+        f = super().vector_field(t, y, s)
+        if not self.offset:
+            return f
+        dtype = jnp.result_type(*jax.tree.leaves(y))
+        t, y = jnp.asarray(t, dtype), jax.tree.map(lambda x: jnp.asarray(x, dtype), y)
+        friction = self.put(t, y, s)
+        parameters, rest = eqx.partition(arrays_of(self.system, dtype), eqx.is_inexact_array)
+        x, tree = jax.tree.flatten((parameters, t, y))
+
+        def place(*x: Array) -> tuple[System, Scalar, Y]:
+            parameters, t, y = jax.tree.unflatten(tree, x)
+            return eqx.combine(parameters, rest), t, y
+
+        for k in self.system.switches:
+            if k.name not in self.offset:
+                continue
+
+            def slope(*x: Array) -> list[Array]:
+                """∂f/∂s, for the values of the other switches that are here."""
+
+                def field(value: Scalar) -> Y:
+                    return _field(*place(*x), friction | {k.name: value}, s)
+
+                value = friction[k.name]
+                return jax.tree.leaves(jax.jvp(field, (value,), (jnp.ones_like(value),))[1])
+
+            g, jumps = _quotient(slope, lambda *x: _height(k, *place(*x)), x, jax.tree.leaves(f), 1 / self.eps)
+            text = (
+                f"Argument `offset` must name switches on whose surface the field is continuous, as |h| is, but "
+                f"`{type(self.system).__name__}.vector_field` jumps on that of `{k.name}` (or h has no gradient there)."
+            )
+            by = eqx.error_if(self.offset[k.name] / jnp.asarray(self.eps, dtype), jumps, text)
+            f = jax.tree.unflatten(jax.tree.structure(f), [a + by * b for a, b in zip(jax.tree.leaves(f), g)])
+        return f
+
+
+def _quotient(
+    top: Callable[..., list[Array]], h: Callable[..., Scalar], x: list[Array], sizes: list[Array], width: Any
+) -> tuple[list[Array], Bool[Array, ""]]:
+    """`top(*x) / h(*x)`, where `top` vanishes with h, and so that its derivatives are right there too.
+
+    On a curve through x along which h grows at the rate one, `top` is zero at the distance -h. So is its Taylor series,
+    top - h top' + h²/2 top'' - ... = 0, and the quotient is top' - h/2 top'' + ..., in which nothing cancels. That is
+    taken where its last two terms are lost in rounding, which says what a small h is, and where the series does vanish.
+
+    **Returns:** the quotient, and whether `top` is found not to vanish, for |h| up to `width`; judged by `sizes`, those
+    of the terms whose difference it may be.
+    """
+    moving = [i for i, v in enumerate(x) if not is_constant(lambda v: h(*x[:i], v, *x[i + 1 :]), v)]
+
+    def along(part: list[Array]) -> Scalar:
+        whole = dict(zip(moving, part))
+        return h(*[whole.get(i, v) for i, v in enumerate(x)])
+
+    gradient = jax.jacfwd(along)([x[i] for i in moving]) if moving else []
+    square = sum([jnp.sum(g**2) for g in gradient], jnp.zeros((), x[0].dtype))
+    ahead = {i: g / jnp.where(square > 0, square, 1) for i, g in zip(moving, gradient)}
+
+    def course(rate: Any) -> list[Any]:
+        return [rate * ahead[i] if i in ahead else None for i in range(len(x))]
+
+    series = Series(lambda *x: [h(*x), *top(*x)], *x)
+    height, *tops = [jnp.asarray(v) for v in series.step(0, *x)]
+    terms = [series.step(1, *course(1))[1:]]
+    for k in range(2, _TERMS + 1):
+        bend, *term = series.step(k, *[None] * len(x))
+        if bend is not None:  # the curve bends back
+            _, *term = series.step(k, *course(-bend))
+        terms.append(term)
+
+    def total(rates: list[Any], h: Array) -> Array:
+        """The series, whose terms may be None for zero."""
+
+        def onto(later: Any, rate: Any) -> Any:
+            return rate if later is None else -h * later + (0 if rate is None else rate)
+
+        out = ft.reduce(onto, reversed(rates), None)
+        return jnp.zeros((), h.dtype) if out is None else out
+
+    def check(value: Array, size: Array, rates: list[Any]) -> tuple[Array, Array]:
+        near, last = total(rates, height), [None if r is None else jnp.abs(r) for r in rates[-2:]]
+        lost, gap = total([None] * (_TERMS - 2) + last, -jnp.abs(height)), jnp.abs(value - height * near)
+        eps = float(jnp.finfo(value.dtype).eps)
+        rounding = eps**0.5 * jnp.abs(value) + 1e3 * eps * (1 + jnp.abs(size))
+        known = (lost <= eps * jnp.abs(near)) & (gap <= rounding) & (square > 0)
+        jump = (gap > rounding + 1e3 * lost * jnp.abs(height)) & (jnp.abs(height) <= width)
+        jump |= (height == 0) & ~known
+        off = value / jnp.where(known, 1, height)
+        return jnp.where(known, total(rates, jnp.where(known, height, 0)), off), jnp.any(jump)
+
+    out, jumps = zip(*[check(*entry) for entry in zip(tops, sizes, map(list, zip(*terms)))])
+    return list(out), ft.reduce(jnp.logical_or, jumps)
 
 
 class _Pulled(System):
@@ -152,16 +254,21 @@ def _banded_mode(model: Model, eta: Any, t: Scalar, y: Y) -> State:
     return state(lax.while_loop(lambda c: c[2] & (c[0] < len(which)), release, carry)[1])
 
 
-def _positive(name: str, value: Any) -> Any:
+def _number(name: str, value: Any, kind: str = "number") -> Any:
     if not eqx.is_array_like(value) or isinstance(value, bool):
-        raise TypeError(f"Argument `{name}` must be a positive number, but got {value!r}.")
+        raise TypeError(f"Argument `{name}` must be a {kind}, but got {value!r}.")
     if jnp.shape(value) != ():
         raise ValueError(f"Argument `{name}` must be a scalar, but has shape {jnp.shape(value)}; use `jax.vmap`.")
+    return value if isinstance(value, jax.Array) else float(value)
+
+
+def _positive(name: str, value: Any) -> Any:
+    value = _number(name, value, "positive number")
     if isinstance(value, Tracer):
         return eqx.error_if(value, ~(value > 0), f"Argument `{name}` must be positive, but is not.")
     if not value > 0:
         raise ValueError(f"Argument `{name}` must be positive, but got {value}.")
-    return value if isinstance(value, jax.Array) else float(value)
+    return value
 
 
 def _frictions(system: Any) -> list[sgn]:
@@ -177,7 +284,12 @@ def _frictions(system: Any) -> list[sgn]:
     return found
 
 
-def smoothed(system: System, eps: Any, kind: Literal["arctan", "tanh", "linear"] = "arctan") -> System:
+def smoothed(
+    system: System,
+    eps: Any,
+    kind: Literal["arctan", "tanh", "linear"] = "arctan",
+    offset: Mapping[str, Any] | None = None,
+) -> System:
     """The smoothing method, Leine (2000), section 2.4: the value of every `sgn` switch is a steep function of its h.
 
         "arctan"    s = (2/π) arctan(ε h)       eq. (2.32)
@@ -192,23 +304,40 @@ def smoothed(system: System, eps: Any, kind: Literal["arctan", "tanh", "linear"]
     sol = nsjax.solve(nsjax.smoothed(system, 1e4), 0.0, 40.0, y0, solver=diffrax.Kvaerno5())
     ```
 
+    Where a continuous field has kinks, |h| = h s, there are smoothings that are not symmetric, and may lose a
+    bifurcation, (5.15) and (5.23): `offset` raises |h| everywhere by c/ε. As ∂f/∂s = h g, that adds (c/ε) g to the
+    field. (Several add up; where absolute values are multiplied, the product of their offsets is left out.) g is found
+    from f and h, on the surface too, by a Taylor series over state, time and parameters.
+
+    ```python
+    nsjax.smoothed(nsjax.gallery.DiscontinuousTranscritical(mu), 10.0, offset={"parameter": 1.0})  # (5.15)
+    ```
+
     **Arguments:**
 
     - `system`: the model. Its `relay` and `impact` switches remain, and are solved event by event.
     - `eps`: steepness ε > 0 [1 / unit of h], one for all switches. Where h is a tuple it is that of their minimum.
     - `kind`: the function.
+    - `offset`: the numbers c (dimensionless) of the switches whose |h| is raised, by their names. They must be kinks:
+        where the field jumps (friction) there is no g.
 
-    **Returns:** a `System` whose fields are `system`, `eps` and `kind`.
+    **Returns:** a `System` whose fields are `system`, `eps`, `kind` and `offset`.
 
-    **Raises:** `ValueError` for an `eps` that is not positive, an unknown kind, a system without a `sgn` switch, and
-    one with a static friction point (`breakaway` > 1), which no function of h can have: see `banded`. A runtime error
-    if that shows only when numbers are there.
+    **Raises:** `ValueError` for an `eps` that is not positive, an unknown kind or name, a system without a `sgn`
+    switch, and one with a static friction point (`breakaway` > 1), which no function of h can have: see `banded`. A
+    runtime error if that shows only when numbers are there; or if the field is found to jump on a surface with an
+    offset, where it is evaluated within |h| <= 1/ε. `TypeError`, there, for an operation without a Taylor series.
     """
     frictions = _frictions(system)
     if kind not in _CURVES:
         known = ", ".join(map(repr, _CURVES))
         raise ValueError(f"Argument `kind` must be one of {known}, but got {kind!r}.")
     eps = _positive("eps", eps)
+    for name in offset or ():
+        if name not in [k.name for k in frictions]:
+            known = ", ".join(f"`{k.name}`" for k in frictions)
+            raise ValueError(f"Argument `offset` must name `sgn` switches of the system, {known}, but got `{name}`.")
+    raised = {name: _number(f"offset[{name!r}]", c) for name, c in (offset or {}).items()}
     for k in frictions:
         bound = k.bound(system)
         name = f"{type(system).__name__}.{k.name}"
@@ -221,7 +350,7 @@ def smoothed(system: System, eps: Any, kind: Literal["arctan", "tanh", "linear"]
             eps = eqx.error_if(jnp.asarray(eps), bound > 1, text)
         elif bound > 1:
             raise ValueError(text)
-    return Smoothed(system, eps, kind)
+    return Smoothed(system, eps, kind, raised)
 
 
 def banded(system: System, eta: Any, rate: Any = 1.0) -> System:

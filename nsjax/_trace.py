@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ._bifurcation import unstable_number
 from ._branch import CLOSED, Strand
 from ._corner import fold_at, hopf_at
 from ._curve import (
@@ -23,13 +24,14 @@ from ._curve import (
     Place,
     Step,
 )
-from ._equilibrium_curve import EITHER, EquilibriumCurve
+from ._equilibrium_curve import EITHER, EquilibriumCurve, Record
 
 
 FIRST, LEAST = 1e-3, 1e-9  # steps, in units of the interval
 TURN = 0.1  # the angle between tangents that is aimed at
 SIDE = 1e-11  # distance from a surface that counts as on its wrong side
-DOUBLE = 1e-10  # value of a test function that counts as a double zero
+DOUBLE = 1e-9  # value of a test function, relative to that at the ends of a step, that counts as a double zero
+UNSEEN = 1e-6  # steps that are not shortened any more for the sake of what a step might hide
 SAME = 1e-7  # a branch point is located to about so much before it is improved
 
 
@@ -63,7 +65,12 @@ class Tracer:
         while len(strand.records) < self.max_points:
             step = advance(self.curve, u, tangent, jnp.asarray(length), traced)
             turn = float(np.arccos(np.clip(float(tangent @ step.tangent), -1, 1))) if step.good else np.inf
-            zeros = self.zeros(step, u, tangent, mode, length) if turn < 0.5 else None
+            zeros = self.zeros(step, u, tangent, mode, length) if step.good else None
+            if turn > 0.5 and zeros is not None:
+                # Beyond a surface the equations may have a kink that no switch tells of; up to it they are smooth.
+                zeros = zeros if zeros and zeros[-1].which >= GUARDS else None
+            if zeros == [] and length > UNSEEN and self.changed(strand.records[-1], step.record):
+                zeros = None
             if zeros is None:
                 length /= 2
                 if length < LEAST:
@@ -73,7 +80,7 @@ class Tracer:
             for zero in zeros:
                 if zero.which not in (FOLD, PAIR, MARK):
                     return self.stop(strand, zero, tangent, mode)
-                self.pass_by(strand, zero, mode)
+                self.pass_by(strand, zero, mode, length)
             if self.closes(u, step.u, mode, len(strand.records)):
                 strand.end = CLOSED
                 strand.add(strand.records[0], strand.modes[0])
@@ -103,12 +110,21 @@ class Tracer:
                 self.marks.append(self.curve.parts(u)[0])
         return u, tangent if zero.which == BRANCH else zero.place.tangent
 
-    def pass_by(self, strand: Strand, zero: Zero, mode: np.ndarray) -> None:
+    def changed(self, before: Record, after: Record) -> bool:
+        """Whether the number of unstable eigenvalues differs beyond doubt."""
+        roots = [np.asarray(record.eigenvalues) for record in (before, after)]
+        clear = all(
+            np.nanmin(np.abs(np.real(r)), initial=np.inf) > 1e-9 * np.nanmax(np.abs(r), initial=0) for r in roots
+        )
+        return clear and unstable_number(roots[0]) != unstable_number(roots[1])
+
+    def pass_by(self, strand: Strand, zero: Zero, mode: np.ndarray, length: float) -> None:
         u, tangent = zero.place.u, zero.place.tangent
         if zero.which == MARK:
             self.marks.append(self.curve.parts(u)[0])
             return
-        bifurcation = (fold_at if zero.which == FOLD else hopf_at)(self.curve, self.name, u, mode, tangent)
+        described = fold_at if zero.which == FOLD else hopf_at
+        bifurcation = described(self.curve, self.name, u, mode, tangent, length / 10)
         if bifurcation is not None:
             strand.add(kept(self.curve, u, jnp.asarray(mode)), mode)
             strand.note(bifurcation)
@@ -139,6 +155,8 @@ class Tracer:
             one_sided = signs[i] != EITHER
             if not np.isfinite(v) or (not one_sided and abs(v) <= 1e-6 * abs(w)):
                 continue  # it sets out from there
+            if length > UNSEEN and abs(w) <= max(1e-6 * abs(v), 10 * SIDE * one_sided) and v > 1e-8 * one_sided:
+                return None  # no step ends where a zero might be, which neither it nor the next would see
             if one_sided and v <= SIDE:
                 if w < -SIDE and i in (LOW, HIGH) and fall < 0:
                     return [Zero(0.0, i, Place(u[0] * 0, u, tangent, u[0] * 0, step.good))]
@@ -150,9 +168,9 @@ class Tracer:
                 # Two zeros, or a double one, of which the ends of the step tell nothing.
                 least = located((0.0, length), i, True)
                 value = sign * float(least.place.value)
-                if value < -DOUBLE:
+                if value < -DOUBLE * max(v, w):
                     found += [located((0.0, least.s), i), located((least.s, length), i)]
-                elif value < DOUBLE and (i == FOLD or i >= GUARDS):
+                elif value < DOUBLE * max(v, w):
                     found.append(least)
         found.sort(key=lambda zero: zero.s)
         ends = [zero for zero in found if zero.which not in (FOLD, PAIR, MARK)]

@@ -475,13 +475,15 @@ def test_orbits_born_at_a_hopf_point():
     """(5.25): radius √d and period 2π/(ω + β d), above only."""
     system = gallery.Hopf(-1.0)
     (b,) = continue_equilibrium(system, Plane(0.1, 0.0), "mu", (-1.0, 1.0)).bifurcations
-    below, above = nsjax.hopf_orbits(system, b, 0.25)
+    below, above = nsjax.hopf_orbits(system, b, [0.25, 0.5])
     assert below == [] and len(above) == 1
-    (orbit,) = above
-    np.testing.assert_allclose(orbit.period, 2 * np.pi / 1.25, rtol=1e-9)
-    np.testing.assert_allclose(np.hypot(*orbit.y0), 0.5, rtol=1e-9)
+    (family,) = above
+    np.testing.assert_allclose([orbit.period for orbit in family], [2 * np.pi / 1.25, 2 * np.pi / 1.5], rtol=1e-9)
+    np.testing.assert_allclose([np.hypot(*orbit.y0) for orbit in family], [0.5, np.sqrt(0.5)], rtol=1e-9)
     told = b.with_orbits(below, above)
     assert told.evidence == "both" and told.criticality == "supercritical" and "periodic orbits 0 -> 1" in str(told)
+    with pytest.raises(ValueError, match="`distance` must be positive"):
+        nsjax.hopf_orbits(system, b, -0.1)
     with pytest.raises(ValueError, match="must be a Hopf bifurcation, but is: saddle-node"):
         nsjax.hopf_orbits(system, b._replace(kind="saddle-node", period=None, criticality=None), 0.1)
 
@@ -491,8 +493,8 @@ def test_orbits_born_subcritically():
     system = gallery.Hopf(-1.0, alpha=1.0)
     (b,) = continue_equilibrium(system, Plane(0.1, 0.0), "mu", (-1.0, 1.0)).bifurcations
     below, above = nsjax.hopf_orbits(system, b, 0.25, sizes=[0.45, 0.6])
-    assert above == [] and len(below) == 1 and not below[0].stable
-    np.testing.assert_allclose(below[0].period, 2 * np.pi / 1.25, rtol=1e-9)
+    assert above == [] and len(below) == 1 and not below[0][0].stable
+    np.testing.assert_allclose(below[0][0].period, 2 * np.pi / 1.25, rtol=1e-9)
 
 
 def test_parameter_of_a_system_within():

@@ -45,6 +45,7 @@ ORDER = (
     "_crossings",
     "_extremum",
     "_regularise",
+    "_kinks",
     "_sweep",
     "_orbit",
     "_guess",

@@ -266,6 +266,111 @@ def test_it_prints_its_numbers():
     assert "eps=1000.0, kind='tanh'" in repr(smoothed(gallery.FallingStickSlip(), 1000, "tanh"))
 
 
+LOPSIDED = {
+    "(5.15)": (gallery.DiscontinuousTranscritical, gallery.ImperfectTranscritical, "parameter"),
+    "(5.23)": (gallery.DiscontinuousPitchfork, gallery.ImperfectPitchfork, "left"),
+}
+KINKS = np.array([[0.3, -0.7], [0, 0], [0.5, 1], [-0.5, 1], [0.5, 1 - 1e-12], [-1e-9, 2e-9], [0, 1e-200], [2, -3]])
+
+
+def derivatives(field):
+    """Values with first and second derivatives, for many points."""
+    return jax.jit(jax.vmap(lambda p: (field(p), jax.jacfwd(field)(p), jax.jacfwd(jax.jacfwd(field))(p))))
+
+
+@pytest.mark.parametrize("key", LOPSIDED)
+def test_offset(key):
+    """Smoothed lopsidedly, a kink whose surface a parameter alone decides as well; on the surface and beside it."""
+    model, truth, name = LOPSIDED[key]
+
+    def ours(p):
+        system = smoothed(model(p[1]), p[2], offset={name: p[3]})
+        return system.vector_field(0.0, gallery.Line(p[0]), system.values(())).x
+
+    def theirs(p):
+        system = truth(p[1], p[2])
+        return system.vector_field(0.0, gallery.Line(p[0]), system.values(())).x + (p[3] - 1) / p[2]
+
+    points = jnp.array([[x, mu, eps, c] for x, mu in KINKS for eps, c in ((10.0, 1.0), (1e3, -2.0))])
+    for have, want in zip(derivatives(ours)(points), derivatives(theirs)(points)):
+        np.testing.assert_allclose(have, want, rtol=1e-12, atol=1e-14)
+
+
+class Bend(nsjax.System):
+    """A field with a kink on a circle, x' = y + |h| (exp(x) + r y²) and, written as two laws, y' = 2 - |h| cos(3t + y);
+    `raised`: as it is with |h| smoothed and raised by 0.7/ε, ε = 10."""
+
+    r: float = 1.0
+    raised: bool = False
+
+    def vector_field(self, t, y, s):
+        h = y.x**2 + y.y**2 - self.r
+        up, down = jnp.exp(y.x) + self.r * y.y**2, -jnp.cos(3 * t + y.y)
+        if self.raised:
+            size = 2 / jnp.pi * jnp.arctan(10 * h) * h + 0.07
+            return Plane(y.y + size * up, 2 + size * down)
+        laws = 0.5 * (1 + s.circle) * (2 + down * h) + 0.5 * (1 - s.circle) * (2 - down * h)
+        return Plane(y.y + s.circle * h * up, laws)
+
+    @nsjax.sgn
+    def circle(self, t, y):
+        return y.x**2 + y.y**2 - self.r
+
+
+@pytest.mark.parametrize(
+    "dtype, bounds", [(jnp.float64, (1e-14, 1e-12, 1e-9)), pytest.param(jnp.float32, (1e-5, 1e-4, 1e-3), marks=SLOW)]
+)
+def test_offset_of_a_curved_surface(dtype, bounds):
+    """What multiplies |h| varies, off the surface too, and at any distance its derivatives are right. (Far off they are
+    those of a quotient, of which rounding takes a part 1/h².)"""
+
+    def field(raised, p):
+        system = Bend(p[2], raised) if raised else smoothed(Bend(p[2]), 10.0, offset={"circle": 0.7})
+        return jnp.stack(system.vector_field(p[3], Plane(p[0], p[1]), system.values(())))
+
+    off = np.array([0, *10.0 ** np.arange(-17, 1), -1e-15, -1e-5, -0.3])
+    points = np.stack([np.cos(0.7) * (1 + off), np.sin(0.7) * (1 + off), 0 * off + 1, 0 * off + 0.4], -1)
+    have, want = (derivatives(functools.partial(field, raised))(jnp.asarray(points, dtype)) for raised in (False, True))
+    for a, b, bound in zip(have, want, bounds):
+        assert a.dtype == dtype
+        np.testing.assert_allclose(a, b, rtol=bound, atol=10 * bound)
+
+
+def test_offset_costs_nothing_unless_given():
+    def program(**kwargs):
+        system = smoothed(gallery.DiscontinuousTranscritical(), 10.0, **kwargs)
+        return str(jax.make_jaxpr(lambda y: system.vector_field(0.0, y, system.values(())))(gallery.Line(0.3)))
+
+    assert program() == program(offset=None) == program(offset={})
+
+
+def test_offset_loses_the_bifurcation():
+    """Two fixed points for every μ, where they met: μ/2 ± about √(π/2)/ε (5.16)."""
+    for mu in (-1e-3, 0.0, 1e-3):
+        system = smoothed(gallery.DiscontinuousTranscritical(mu), 10.0, offset={"parameter": 1.0})
+        upper, lower = (nsjax.find_equilibrium(system, gallery.Line(x)) for x in (0.2, -0.2))
+        np.testing.assert_allclose(upper.y.x + lower.y.x, mu, atol=1e-12)
+        assert upper.y.x - mu / 2 > 0.1
+
+
+class Drag(nsjax.System):
+    """Friction that falls with speed: the field jumps."""
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - s.belt / (1 + (y.v - 0.2) ** 2))
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y.v - 0.2
+
+
+@pytest.mark.parametrize("v", [0.2, 0.2 + 1e-9, 0.23])
+def test_offset_where_the_field_jumps(v):
+    system = smoothed(Drag(), 10.0, offset={"belt": 1.0})
+    with pytest.raises(RuntimeError, match="`Drag.vector_field` jumps on that of `belt`"):
+        system.vector_field(0.0, Motion(1.0, v), system.values(()))
+
+
 class Squared(nsjax.System):
     def vector_field(self, t, y, s):
         return Point(-s.side - s.side**2)
@@ -283,6 +388,16 @@ MISTAKES = [
     (lambda: smoothed(FALLING, "tanh"), TypeError, "Argument `eps` must be a positive number, but got 'tanh'"),
     (lambda: smoothed(FALLING, np.ones(2)), ValueError, "`eps` must be a scalar.*use `jax.vmap`"),
     (lambda: smoothed(FALLING, 1e3, "erf"), ValueError, "one of 'arctan', 'tanh', 'linear', but got 'erf'"),
+    (
+        lambda: smoothed(FALLING, 1e3, offset={"wall": 1.0}),
+        ValueError,
+        "must name `sgn` switches.*`belt`, but got `wall`",
+    ),
+    (
+        lambda: smoothed(FALLING, 1e3, offset={"belt": "1"}),
+        TypeError,
+        r"`offset\['belt'\]` must be a number, but got '1'",
+    ),
     (lambda: banded(gallery.StickSlip, 1e-6), TypeError, "Argument `system` must be an instance.*Call it"),
     (lambda: banded(gallery.BouncingBall(), 1e-6), ValueError, "`BouncingBall` has only `floor`"),
     (lambda: smoothed(gallery.SmoothBlock(), 1e3), ValueError, "must have a `sgn` switch.*has no switch"),

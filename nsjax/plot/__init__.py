@@ -1,6 +1,7 @@
 """Pictures of solutions and orbits. Each function draws into `ax` (a new figure by default), returns the axes and
 changes no global style. Matplotlib is imported by the first picture, not with nsjax."""
 
+from ._branch import bifurcation_diagram as bifurcation_diagram
 from ._eigenvalues import eigenvalue_path as eigenvalue_path
 from ._matrix import fundamental_matrix as fundamental_matrix, multipliers as multipliers
 from ._path import components as components
