@@ -156,7 +156,9 @@ def node_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, arrivi
     met = tuple(k for k in surfaces if k in left) if halves else tuple(surfaces)
     bifurcation = _described(curve, name, u, halves, first, met, continuous)
     if degenerate and not met:
-        bifurcation = bifurcation._replace(kind="degenerate branch point", by_crossing=("branch point",))
+        bifurcation = bifurcation._replace(
+            kind="degenerate branch point", evidence="crossing", by_crossing=("branch point",)
+        )
     return Node(u, halves, bifurcation)
 
 
@@ -271,12 +273,13 @@ def hopf_at(
     sums = np.abs(roots[:, None] + roots) + np.diag(np.full(len(roots), np.inf))
     i, j = np.unravel_index(np.argmin(sums), sums.shape)
     omega = abs(roots[i].imag)
-    if abs(roots[i].real) > 1e-6 * omega or roots[i].imag * roots[j].imag >= 0:
+    if roots[i].imag * roots[j].imag >= 0:
         return None
     both = [_half(curve, u, mode, way * tangent, True, min(PROBE, length)) for way in (-1, 1)]
     halves = [half for half in both if half is not None]
     pairs = abs(halves[0].unstable - halves[1].unstable) // 2 if len(halves) == 2 else 1
-    if not pairs:
+    # Of pairs that cross next to one another one may be beside the axis here.
+    if not pairs or (pairs == 1 and abs(roots[i].real) > 1e-6 * omega):
         return None
     found = _described(curve, name, u, halves, None, (), True)
     # On a surface that holds the state the plane of the pair is not that of the coordinates.

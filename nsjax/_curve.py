@@ -172,6 +172,17 @@ def locate(
 
 
 @eqx.filter_jit
+def on_surface(curve: Curve, u: Array, mode: Array, which: Array) -> Array:
+    """The point of the curve, next to `u`, at which a guard vanishes."""
+
+    def residual(u: Array, _: Any) -> Array:
+        return jnp.append(curve.residual(u, mode), distances(curve, u)[which])
+
+    found, good = find_root(residual, u, None, TOLERANCE, 12)
+    return jnp.where(good, found, u)
+
+
+@eqx.filter_jit
 def branch_point(curve: Curve, u: Array, mode: Array) -> tuple[Array, Bool[Array, ""]]:
     """A simple branch point near `u`: with ψ the left null vector of DF, F + β ψ = 0, ψᵀ DF = 0, |ψ| = 1 are regular
     equations there, where F = 0 itself is not; Moore (1980)."""

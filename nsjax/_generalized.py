@@ -52,8 +52,9 @@ def generalized_jacobian(
 ) -> GeneralizedJacobian:
     """The generalized Jacobian of a field that is continuous, but has kinks on the surfaces of `sgn` switches.
 
-    Such a field is written with `sgn` switches: |h| is `h * s.name`, max(0, h) is `h * (1 + s.name) / 2`. Away from
-    surfaces there is one vertex, the Jacobian.
+    Such a field is written with `sgn` switches: |h| is `h * s.name`, max(0, h) is `h * (1 + s.name) / 2`; or with
+    `jnp.abs` and the like, of which `mark_kinks` makes such switches. Away from surfaces there is one vertex, the
+    Jacobian.
 
     **Arguments:**
 

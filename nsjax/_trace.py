@@ -8,7 +8,7 @@ import numpy as np
 
 from ._bifurcation import unstable_number
 from ._branch import CLOSED, Strand
-from ._corner import fold_at, hopf_at
+from ._corner import active, fold_at, hopf_at
 from ._curve import (
     advance,
     BRANCH,
@@ -20,6 +20,7 @@ from ._curve import (
     locate,
     LOW,
     MARK,
+    on_surface,
     PAIR,
     Place,
     Step,
@@ -74,6 +75,12 @@ class Tracer:
             if zeros is None:
                 length /= 2
                 if length < LEAST:
+                    on = np.flatnonzero(active(self.curve, u, mode))
+                    if len(on):
+                        # There is no way past the surface with this side's equations: one ends on it.
+                        u = on_surface(self.curve, u, traced, jnp.asarray(on[0]))
+                        strand.add(kept(self.curve, u, traced), mode)
+                        return u, tangent
                     strand.end = f"the last point that could be found, {self.name} = {self.value(u):.6g}"
                     return u, tangent
                 continue
@@ -163,7 +170,9 @@ class Tracer:
                 if w < -SIDE:
                     return None
             elif w < (-SIDE if one_sided else 0):
-                found.append(located((0.0, length), i))
+                zero = located((0.0, length), i)
+                # A determinant may jump instead, where the field has a kink that no switch tells of.
+                found += [zero] if one_sided or abs(zero.place.value) <= 1e-3 * max(v, -w) else []
             elif v > SIDE and fall < 0 < rise and _dips(v, w, fall, rise, length):
                 # Two zeros, or a double one, of which the ends of the step tell nothing.
                 least = located((0.0, length), i, True)
@@ -176,9 +185,11 @@ class Tracer:
         ends = [zero for zero in found if zero.which not in (FOLD, PAIR, MARK)]
         if not ends:
             return found
+        # Where determinants jump on a surface, on account of a kink that no switch tells of, that is no branch point.
+        first = next((zero for zero in ends if zero.which >= GUARDS and zero.s < ends[0].s + SAME), ends[0])
         # At a branch point, which is not located as well as the others, the curve itself may be vertical.
-        slack = SAME if ends[0].which == BRANCH else 1e-10
-        return [zero for zero in found if zero.s < ends[0].s - slack and zero.which in (FOLD, PAIR, MARK)] + ends[:1]
+        slack = SAME if first.which == BRANCH else 1e-10
+        return [zero for zero in found if zero.s < first.s - slack and zero.which in (FOLD, PAIR, MARK)] + [first]
 
 
 def _dips(v: float, w: float, fall: float, rise: float, length: float) -> bool:

@@ -471,6 +471,161 @@ def test_pitfall_25_corner_and_fold_within_one_step():
     np.testing.assert_allclose([fold.value, fold.y.x], [-5e-4, -1e-3], atol=1e-10)
 
 
+class Forms(nsjax.System):
+    """Normal forms of two bifurcations side by side, at μ = m and μ = m + d."""
+
+    mu: float = -1.0
+    m: float = 0.0
+    d: float = 0.0
+    kind: str = "pitchfork"
+
+    def vector_field(self, t, y, s):
+        def rate(x, mu):
+            if self.kind == "pitchfork":
+                return jnp.stack([mu * x[0] - x[0] ** 3])
+            if self.kind == "transcritical":
+                return jnp.stack([mu * x[0] - x[0] ** 2])
+            r = x @ x
+            return jnp.stack([mu * x[0] - x[1] - x[0] * r, x[0] + mu * x[1] - x[1] * r])
+
+        n = len(y) // 2
+        return jnp.concatenate([rate(y[:n], self.mu - self.m), rate(y[n:], self.mu - self.m - self.d)])
+
+
+@pytest.mark.parametrize("kind", ["pitchfork", "transcritical", "Hopf"])
+def test_wherever_in_the_interval(kind):
+    """Places that steps end on, that bisection hits exactly, and where rows of the equations vanish in all digits."""
+    zero = jnp.zeros(4 if kind == "Hopf" else 2)
+    for m in [-0.95, -0.938, -0.898, -0.858, -0.75, -0.5, -0.35, 0.1, 0.25, 0.5, 0.55, 0.85]:
+        found = continue_equilibrium(Forms(m=m, d=3.0, kind=kind), zero, "mu", (-1.0, 1.0)).bifurcations
+        assert [b.kind for b in found] == [kind], m
+        np.testing.assert_allclose(found[0].value, m, atol=1e-10)
+
+
+def test_at_one_place_at_once():
+    """Two Hopf bifurcations, or two pitchforks, at one place or so close that no step tells them apart."""
+    for d in (0.0, 1e-5):
+        (b,) = continue_equilibrium(Forms(m=0.3, d=d, kind="Hopf"), jnp.zeros(4), "mu", (-1.0, 1.0)).bifurcations
+        assert b.kind == "Hopf-Hopf" and abs(b.value - 0.3) <= 2 * d + 1e-7
+    found = continue_equilibrium(Forms(m=0.3, d=0.01, kind="Hopf"), jnp.zeros(4), "mu", (-1.0, 1.0)).bifurcations
+    np.testing.assert_allclose([b.value for b in found], [0.3, 0.31], atol=1e-10)
+    (b,) = continue_equilibrium(Forms(m=0.2), jnp.zeros(2), "mu", (-1.0, 1.0)).bifurcations
+    assert b.kind == "degenerate branch point" and abs(b.value - 0.2) < 1e-7
+
+
+class Lorenz(nsjax.System):
+    rho: float = 10.0
+
+    def vector_field(self, t, y, s):
+        return jnp.stack([10 * (y[1] - y[0]), y[0] * (self.rho - y[2]) - y[1], y[0] * y[1] - 8 / 3 * y[2]])
+
+
+def test_lorenz():
+    """A pitchfork at ρ = 1, and subcritical Hopf bifurcations at ρ = σ (σ + β + 3)/(σ - β - 1) = 470/19."""
+    branch = continue_equilibrium(Lorenz(), jnp.zeros(3), "rho", (0.0, 30.0))
+    kinds = [(b.kind, b.criticality) for b in branch.bifurcations]
+    assert kinds == [("pitchfork", "supercritical")] + [("Hopf", "subcritical")] * 2 and len(branch.branches) == 2
+    np.testing.assert_allclose([b.value for b in branch.bifurcations], [1, 470 / 19, 470 / 19], rtol=1e-11)
+    period = 2 * np.pi / np.sqrt(8 / 3 * (470 / 19 + 10))
+    np.testing.assert_allclose(branch.bifurcations[1].period, period, rtol=1e-10)
+
+
+class Pendulum(nsjax.System):
+    mu: float = -1.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, self.mu * y.x - y.x**3)
+
+
+def test_conservative_system():
+    """Its eigenvalues stay on the axis: that is no Hopf bifurcation, wherever one begins."""
+    for mu in (-1.0, -0.7):
+        branch = continue_equilibrium(Pendulum(mu), Motion(0.0, 0.0), "mu", (-1.0, 1.0))
+        assert [(b.kind, b.criticality) for b in branch.special] == [("pitchfork", "supercritical")]
+
+
+class Belt(nsjax.System):
+    """A mass on a belt, with friction that falls with the relative velocity, written with a plain absolute value."""
+
+    v_dr: float = 5.0
+
+    def vector_field(self, t, y, s):
+        force = s.belt / (1 + jnp.abs(y.v - self.v_dr))
+        return Motion(y.v, -y.x - 0.1 * y.v - force)
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y.v - self.v_dr
+
+
+def test_unmarked_kink_beside_a_switch():
+    """Hopf where 1/(1 + v_dr)² = 0.1. Below v_dr = 0 there is no way on: at rest all |x| <= 1 are equilibria."""
+    branch = continue_equilibrium(Belt(), Motion(0.2, 0.0), "v_dr", (-1.0, 5.0))
+    end, hopf = branch.special
+    assert (end.kind, end.count) == ("continuum", (0, 1)) and hopf.kind == "Hopf"
+    np.testing.assert_allclose([end.value, hopf.value], [0, np.sqrt(10) - 1], atol=1e-10)
+    assert branch.ends == ("continuum of equilibria at v_dr = 0", "v_dr = 5")
+
+
+class Two(nsjax.System):
+    """x' = μ - x + |x| - |x - d|, of slopes -1, 1, -1: an S whose folds are at x = 0, μ = d and x = d, μ = 0."""
+
+    mu: float = -1.0
+    d: float = 1e-3
+
+    def vector_field(self, t, y, s):
+        return Line(self.mu - y.x + s.first * y.x - s.second * (y.x - self.d))
+
+    @nsjax.sgn
+    def first(self, t, y):
+        return y.x
+
+    @nsjax.sgn
+    def second(self, t, y):
+        return y.x - self.d
+
+
+@pytest.mark.parametrize("d", [1e-3, 1e-5, 1e-7])
+def test_corners_next_to_each_other(d):
+    branch = continue_equilibrium(Two(d=d), Line(-1.0), "mu", (-1.0, 1.0))
+    assert [b.kind for b in branch.bifurcations] == ["saddle-node"] * 2
+    np.testing.assert_allclose([b.value for b in branch.bifurcations], [0, d], atol=1e-12)
+    assert len(branch.branches) == 1 and set(branch.ends) == {"mu = -1", "mu = 1"}
+
+
+class Bratu(nsjax.System):
+    lam: float = 0.5
+
+    def vector_field(self, t, y, s):
+        n = len(y)
+        wide = jnp.concatenate([jnp.zeros(1), y, jnp.zeros(1)])
+        return (n + 1) ** 2 * (wide[2:] - 2 * y + wide[:-2]) + self.lam * jnp.exp(y)
+
+
+@pytest.mark.slow
+def test_larger_systems():
+    """Determinants of 136 rows are out of range. The fold of the discretised problem by scipy."""
+    import scipy.optimize
+
+    n = 17
+    branch = continue_equilibrium(Bratu(), jnp.full(n, 0.1), "lam", (0.0, 4.0), max_points=300)
+    (fold,) = branch.bifurcations
+    middle = n // 2
+
+    def lam_of(top):
+        def residual(z):
+            y, lam = z[:-1], z[-1]
+            wide = np.concatenate([[0], y, [0]])
+            f = (n + 1) ** 2 * (wide[2:] - 2 * y + wide[:-2]) + lam * np.exp(y)
+            return [*f, y[middle] - top]
+
+        return scipy.optimize.root(residual, [*np.asarray(fold.y), fold.value], tol=1e-13).x[-1]
+
+    most = scipy.optimize.minimize_scalar(lambda top: -lam_of(top), bounds=(1.0, 1.4), options=dict(xatol=1e-10))
+    assert fold.kind == "saddle-node"
+    np.testing.assert_allclose(fold.value, -most.fun, rtol=1e-9)
+
+
 def test_orbits_born_at_a_hopf_point():
     """(5.25): radius √d and period 2π/(ω + β d), above only."""
     system = gallery.Hopf(-1.0)

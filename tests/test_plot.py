@@ -320,3 +320,31 @@ def test_multipliers_of_several_orbits():
     failed = types.SimpleNamespace(multipliers=np.full(2, np.nan), system=types.SimpleNamespace(period=None))
     with pytest.raises(ValueError, match="was found"):
         plot.multipliers(failed)
+
+
+def test_bifurcation_diagram():
+    """Stable and unstable stretches end where they should; points are named; orbits are grey."""
+    system = gallery.Hopf(-1.0)
+    branch = nsjax.continue_equilibrium(system, gallery.Plane(0.0, 0.0), "mu", (-1.0, 1.0))
+    _, above = nsjax.hopf_orbits(system, branch.bifurcations[0], [0.25, 0.5], sizes=[0.5])
+    ax = plot.bifurcation_diagram(branch, orbits=above, labels={"mu": "μ [-]", "x1": "x [m]"})
+    assert ax.get_xlabel() == "μ [-]" and ax.get_ylabel() == "x [m]"
+    lines = {line.get_label(): line for line in ax.lines}
+    stable, unstable = lines["stable equilibrium"], lines["unstable equilibrium"]
+    assert stable.get_linestyle() == "-" and unstable.get_linestyle() == "--"
+    np.testing.assert_allclose([stable.get_xdata().min(), unstable.get_xdata().max()], [-1, 1])
+    assert abs(stable.get_xdata().max()) < 0.05 and abs(unstable.get_xdata().min()) < 0.05
+    heights = sorted(y for line in ax.lines if "periodic" in str(line.get_label()) for y in line.get_ydata())
+    np.testing.assert_allclose(heights, [-np.sqrt(0.5), -0.5, 0.5, np.sqrt(0.5)], rtol=2e-3)
+    assert [text.get_text() for text in ax.texts] == ["Hopf,\nsupercritical"]
+
+
+def test_bifurcation_diagram_of_a_function():
+    start = gallery.Line(0.0)
+    branch = nsjax.continue_equilibrium(gallery.DiscontinuousPitchfork(-1.0), start, "mu", (-1.0, 1.0))
+    ax = plot.bifurcation_diagram(branch, lambda y: y.x**2, labels={"measure": "x² [m²]"}, legend=False)
+    assert ax.get_ylabel() == "x² [m²]" and ax.get_legend() is None
+    assert min(np.min(line.get_ydata()) for line in ax.lines) >= 0
+    assert [text.get_text() for text in ax.texts] == ["discontinuous\npitchfork,\nsupercritical"]
+    with pytest.raises(ValueError, match="`measure` must be one of x, or a function, but got 'v'"):
+        plot.bifurcation_diagram(branch, "v")
