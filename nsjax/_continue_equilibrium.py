@@ -208,8 +208,7 @@ class _Tree:
         half.used = True
         strand = Strand()
         self.depart(strand, half)
-        if node.bifurcation.kind != "none" or node.bifurcation.discontinuous:
-            strand.note(node.bifurcation)
+        _note(strand, node)
         return self.walk(strand, *_outset(half))
 
     def depart(self, strand: Strand, half: Half) -> None:
@@ -231,8 +230,7 @@ class _Tree:
             if node is None:
                 node = node_at(curve, self.tracer.name, u, mode, tangent)
                 self.nodes.append(node)
-            if node.bifurcation.kind != "none" or node.bifurcation.discontinuous:
-                strand.note(node.bifurcation)
+            _note(strand, node)
             arrived = matching(node.halves, mode, -tangent)
             ahead = None if arrived is None else arrived.partner
             if arrived is not None:
@@ -244,6 +242,12 @@ class _Tree:
             if node.bifurcation.discontinuous:
                 self.depart(strand, ahead)
             u, tangent, mode = _outset(ahead)
+
+
+def _note(strand: Strand, node: Node) -> None:
+    """Unless it is a point like any other, as where the branch runs along a surface."""
+    if node.bifurcation.kind != "none" or node.bifurcation.discontinuous:
+        strand.note(node.bifurcation)
 
 
 def _outset(half: Half) -> tuple[Any, Any, np.ndarray]:

@@ -10,13 +10,13 @@ import numpy as np
 from ._bifurcation import Bifurcation, classified, counted, HalfBranch, odd_one, unstable_number
 from ._crossings import eigenvalue_crossings
 from ._curve import advance, branching, kept, linearised, near, row_sizes, Step
-from ._equilibrium_curve import EITHER, EquilibriumCurve, first_lyapunov_coefficient
+from ._equilibrium_curve import EquilibriumCurve, first_lyapunov_coefficient
 from ._pencil import EigenvalueCrossing
 
 
 ACTIVE = 1e-8  # distance at which a point lies on a surface: it is located to some 1e-12
 NEAR = 3e-8  # distance within which two points are one
-SINGULAR = 1e-8  # relative to the largest singular value, and to what the equations are elsewhere
+SINGULAR = 1e-8  # of the equations in units of what they are nearby
 PROBE = 1e-4  # length of the step by which a half-branch is tried: nothing is read off it but signs
 CONTINUUM = 1e-12  # change of the parameter in such a step that is none
 MODES = 6561  # so many combinations of sides are tried
@@ -91,7 +91,7 @@ def _half(
     """The half-branch in a direction, if there is one: if its first step stays on the right sides."""
     signs = curve.armed(mode)
     here = np.asarray(near(curve, u))
-    matters = (np.abs(signs) == 1) & (signs != EITHER)
+    matters = np.abs(signs) == 1
     if np.any(matters & (signs * here < -ACTIVE)):
         return None
     mode_array, direction = jnp.asarray(mode), jnp.asarray(tangent)
@@ -154,11 +154,10 @@ def node_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, arrivi
     left = _left(curve, halves)
     first = _partners(halves)
     met = tuple(k for k in surfaces if k in left) if halves else tuple(surfaces)
-    bifurcation = _described(curve, name, u, halves, first, met, continuous)
+    smooth = () if all(half.regular for half in halves) else ("branch point",)
+    bifurcation = _described(curve, name, u, halves, first, met, continuous, smooth)
     if degenerate and not met:
-        bifurcation = bifurcation._replace(
-            kind="degenerate branch point", evidence="crossing", by_crossing=("branch point",)
-        )
+        bifurcation = bifurcation._replace(kind="degenerate branch point", evidence="crossing")
     return Node(u, halves, bifurcation)
 
 
@@ -216,17 +215,17 @@ def _described(
     u: Any,
     halves: list[Half],
     first: tuple[Half, Half] | None,
-    surfaces: tuple[str, ...],
-    continuous: bool,
+    surfaces: tuple[str, ...] = (),
+    continuous: bool = True,
+    smooth: tuple[str, ...] = (),
 ) -> Bifurcation:
+    """`smooth`: what a smooth point is by its singular equations; where eigenvalues jump, their crossings tell."""
     public = [_public(curve, half) for half in halves]
     by_count, criticality = counted(public)
     crossings: list[EigenvalueCrossing] = []
     places: list[dict[str, float]] = []
-    by_crossing: tuple[str, ...] | None = None
-    if not surfaces:
-        by_crossing = {"none": (), "saddle-node": ("saddle-node",)}.get(by_count, ("branch point",))
-    elif continuous and len(halves) > 1:
+    by_crossing: tuple[str, ...] | None = None if surfaces else smooth
+    if surfaces and continuous and len(halves) > 1:
         by_crossing, crossings, places = _crossed(curve, *_ordered(first or (halves[0], halves[1])))
     kind, evidence = classified(by_count, by_crossing)
     omegas = [c.eigenvalue.imag for c in crossings if c.kind == "pair" and c.direction]
@@ -254,12 +253,10 @@ def fold_at(
 ) -> Bifurcation:
     """A point at which the branch is vertical: whether it turns back is seen a step further on either side."""
     both = [_half(curve, u, mode, way * tangent, True, min(10 * PROBE, length)) for way in (-1, 1)]
-    found = _described(curve, name, u, [half for half in both if half is not None], None, (), True)
-    return (
-        found._replace(kind="hysteresis point", by_crossing=("saddle-node", "saddle-node"), evidence="count")
-        if (found.kind == "none")
-        else found
-    )
+    found = _described(curve, name, u, [half for half in both if half is not None], None, smooth=("saddle-node",))
+    if found.kind != "none":
+        return found
+    return found._replace(kind="hysteresis point", by_crossing=("saddle-node", "saddle-node"))
 
 
 def hopf_at(
@@ -281,7 +278,7 @@ def hopf_at(
     # Of pairs that cross next to one another one may be beside the axis here.
     if not pairs or (pairs == 1 and abs(roots[i].real) > 1e-6 * omega):
         return None
-    found = _described(curve, name, u, halves, None, (), True)
+    found = _described(curve, name, u, halves, None)
     # On a surface that holds the state the plane of the pair is not that of the coordinates.
     held = int(record.held) > 0
     coefficient = 0.0 if held else float(first_lyapunov_coefficient(curve, u, jnp.asarray(mode)))
@@ -347,7 +344,8 @@ def _crossed(
             continue
         # Where ∂f/∂μ has no part that the singular J(q) cannot reach, branches meet (section 5.4).
         whole = (1 - q) * ends[0] + q * ends[1]
-        scale = np.abs(whole).max(axis=1, keepdims=True)
+        scale = np.abs(ends).max(axis=(0, 2))[:, None]
+        scale = np.where(scale > 0, scale, 1)
         left = np.linalg.svd(whole[:, :-1] / scale)[0][:, -1]
         reached = abs(left @ (whole / scale)[:, -1]) <= 1e-8
         kinds += ["branch point" if reached else "saddle-node"] * bool(crossing.direction)

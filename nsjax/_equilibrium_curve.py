@@ -28,8 +28,6 @@ class Record(NamedTuple):
     y: Y
     parameter: Scalar
     multipliers: Float[Array, " switches"]
-    jacobian: Float[Array, "n n"]
-    by_parameter: Float[Array, " n"]
     eigenvalues: Complex[Array, " n"]
     held: Int[Array, ""]
     stable: Bool[Array, ""]
@@ -82,18 +80,13 @@ class EquilibriumCurve(Curve):
         model, y, sigma = self.at(u)
         state = self.state(mode)
         values = switch_values(model, self.t, state, sigma)
-        jacobian, motion, held, attracts = linear_motion(model, self.t, y, state, values)
+        _, motion, held, attracts = linear_motion(model, self.t, y, state, values)
         x, _, value = self.parts(u)
-
-        def field(value: Array) -> Array:
-            moved = eqx.tree_at(lambda m: m.system, model, put_parameter(model.system, self.path, value))
-            return jfu.ravel_pytree(moved.flow(self.t, y, state))[0]
-
         roots = free_eigenvalues(motion, held)
         free = jnp.arange(len(x), dtype=held.dtype) < len(x) - held
         stable = jnp.all(jnp.where(free, roots.real < 0, True)) & attracts
         multipliers = jnp.stack([jnp.asarray(v, x.dtype) for v in values]) if values else jnp.zeros(0, x.dtype)
-        return Record(y, value, multipliers, jacobian, jax.jacfwd(field)(value), roots, held, stable)
+        return Record(y, value, multipliers, roots, held, stable)
 
     # Guards, switch by switch: the components of h, and their minimum if there are several; of one that can hold what
     # is left to the bounds of its value, and to ±1 if it holds beyond. Of a relay both surfaces.

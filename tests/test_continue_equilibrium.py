@@ -652,6 +652,20 @@ def test_orbits_born_subcritically():
     np.testing.assert_allclose(below[0][0].period, 2 * np.pi / 1.25, rtol=1e-9)
 
 
+@pytest.mark.slow
+def test_orbits_born_at_a_discontinuous_hopf_point():
+    """(5.29): radius d, period 2π, above only, and a multiplier exp(-2π)."""
+    system = gallery.DiscontinuousHopf(-1.0)
+    (b,) = continue_equilibrium(system, Plane(0.0, 0.0), "mu", (-1.0, 1.0)).bifurcations
+    below, above = nsjax.hopf_orbits(system, b, [0.5, 1.0])
+    assert below == [] and len(above) == 1
+    np.testing.assert_allclose([np.hypot(*orbit.y0) for orbit in above[0]], [0.5, 1.0], rtol=1e-9)
+    np.testing.assert_allclose([orbit.period for orbit in above[0]], 2 * np.pi, rtol=1e-9)
+    np.testing.assert_allclose(np.abs(above[0][1].multipliers), [1, np.exp(-2 * np.pi)], rtol=1e-6)
+    told = b.with_orbits(below, above)
+    assert told.orbits == (0, 1) and told.criticality == "supercritical" and told.evidence == "both"
+
+
 def test_parameter_of_a_system_within():
     """`smoothed(system)` is continued over the parameter of `system`: (5.40) again."""
     system = nsjax.smoothed(gallery.HopfPitchfork(-1.0), 10.0)
