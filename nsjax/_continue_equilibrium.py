@@ -1,6 +1,7 @@
 """The continuation of equilibria over a parameter, through folds and corners, along every branch."""
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -67,7 +68,7 @@ def continue_equilibrium(
         what it changes over the interval at the start's rate, or 1. Steps are measured in it, and in the interval.
     - `max_step`: the longest step.
     - `max_points`: of one branch; a branch that has more ends there, and says so in `Branch.ends`.
-    - `max_branches`: so many at most.
+    - `max_branches`: so many at most; if there are more a warning says so.
     - `t`: the time at which forces are taken.
 
     **Returns:** the `Branch` through the (first) start, with the others in `Branch.others`.
@@ -161,6 +162,8 @@ class _Tree:
             self.follow_all()
         if not self.found:
             raise ValueError(ALONE)
+        if any(half.side and not half.used for node in self.nodes for half in node.halves):
+            warnings.warn(f"There are more than `max_branches` = {self.max_branches} branches.", stacklevel=3)
         first, *others = self.found
         return dataclasses.replace(first, others=tuple(others))
 

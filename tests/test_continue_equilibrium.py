@@ -700,5 +700,7 @@ def test_errors():
     virtual = next(e for e in virtual if not e.admissible)
     with pytest.raises(ValueError, match="what was found is virtual"):
         continue_equilibrium(gallery.HopfPitchfork(-1.0), virtual, "mu", (-1.0, 1.0))
+    with pytest.warns(UserWarning, match="more than `max_branches` = 1"):
+        continue_equilibrium(gallery.Pitchfork(-1.0), Line(0.0), "mu", (-1.0, 1.0), max_branches=1)
     branch = continue_equilibrium(system, start, "mu", (-1.0, 1.0), max_points=10)
     assert any(end.startswith("max_points = 10") for end in branch.ends)
