@@ -131,3 +131,28 @@ def test_there_is_none():
 def test_time_enters():
     with pytest.raises(ValueError, match="`Trilinear` has no equilibrium, as time enters its vector field"):
         find_equilibrium(gallery.Trilinear(), Motion(0.0, 0.0))
+
+
+class Curved(nsjax.System):
+    """Slides on a curved surface, along which its pseudo-equilibrium moves with p."""
+
+    p: float = 0.3
+
+    def vector_field(self, t, y, s):
+        x, z, w = y
+        rate = self.p - x + 0.3 * w + 0.2 * z * s.sheet
+        return jnp.stack([rate, 0.5 * x - 0.4 * w * z - s.sheet + 0.1, -w + x * z + 0.3 * s.sheet])
+
+    @nsjax.sgn
+    def sheet(self, t, y):
+        return y[1] - y[0] ** 2 - 0.5 * y[2] ** 2
+
+
+def test_derivatives_of_eigenvalues_on_a_curved_surface():
+    def roots(p):
+        guess = jnp.array([0.3, 0.1, 0.0])
+        return find_equilibrium(Curved(p=p), guess, mode={"sheet": 0}, throw=False).eigenvalues[:2].real
+
+    step = 1e-5
+    differences = (roots(0.3 + step) - roots(0.3 - step)) / (2 * step)
+    np.testing.assert_allclose(jax.jacfwd(roots)(0.3), differences, rtol=1e-8)
