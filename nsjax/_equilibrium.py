@@ -82,6 +82,10 @@ def switch_values(model: Model, t: Scalar, state: State, sigma: Array) -> tuple[
     return tuple(s)
 
 
+def stacked_values(s: tuple[Any, ...], dtype: Any) -> Float[Array, " switches"]:
+    return jnp.stack([jnp.asarray(v, dtype) for v in s]) if s else jnp.zeros(0, dtype)
+
+
 def balance(model: Model, t: Scalar, y: Y, sigma: Array, state: State) -> Float[Array, " equations"]:
     """What vanishes at an equilibrium: the field; h on the surfaces that hold it, whose values are unknowns beside the
     state, (2.19)-(2.20); and what the values of the others differ from their signs."""
@@ -99,7 +103,6 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, ma
     """Newton's method on f(y, s) = 0 in a given mode, with the values of the surfaces that hold the state as unknowns
     beside it, and h = 0 there as their equations."""
     x0, unravel = jfu.ravel_pytree(lax.stop_gradient(y0))
-    n = len(x0)
     model = Model(frozen(system), jnp.ones_like(t), t, y0)
     holdable = model.holdable
     state = nearest_state(model, t, y0, mode)
@@ -121,7 +124,6 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, ma
     live = _with(model, system)
     y, s = unravel(z[0]), switch_values(live, t, state, z[1])
     jacobian, motion, held, attracts = linear_motion(live, t, y, state, s)
-    free = jnp.arange(n, dtype=held.dtype) < n - held
     roots = free_eigenvalues(motion, held)
     admissible, boundary = _place(model, t, frozen(y), state, frozen(s))
     size = 1 + jnp.max(jnp.abs(z[0]))
@@ -130,11 +132,11 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, ma
         system=system,
         y=y,
         mode=jnp.stack(state.mode) if state.mode else jnp.zeros(0, jnp.int32),
-        multipliers=jnp.stack([jnp.asarray(v, t.dtype) for v in s]) if s else jnp.zeros(0, t.dtype),
+        multipliers=stacked_values(s, t.dtype),
         jacobian=jacobian,
         eigenvalues=roots,
         held=held,
-        stable=jnp.all(jnp.where(free, roots.real < 0, True)) & attracts,
+        stable=all_decay(roots, held) & attracts,
         admissible=admissible,
         boundary=boundary,
         isolated=isolated,
@@ -197,8 +199,16 @@ def free_eigenvalues(motion: Float[Array, "n n"], held: Int[Array, ""]) -> Compl
     """Largest real part first; those off the surfaces come last, and are not numbers."""
     roots = eigenvalues(motion)
     order = jnp.argsort(-lax.stop_gradient(roots).real)
-    index = jnp.arange(len(roots), dtype=held.dtype)
-    return jnp.where(index < len(roots) - held, roots[order], jnp.nan)
+    return jnp.where(_free(len(roots), held), roots[order], jnp.nan)
+
+
+def all_decay(roots: Complex[Array, " n"], held: Int[Array, ""]) -> Bool[Array, ""]:
+    """Whether the eigenvalues of what can move have negative real parts."""
+    return jnp.all(jnp.where(_free(len(roots), held), roots.real < 0, True))
+
+
+def _free(n: int, held: Int[Array, ""]) -> Bool[Array, " n"]:
+    return jnp.arange(n, dtype=held.dtype) < n - held
 
 
 def _place(model: Model, t: Scalar, y: Y, state: State, s: tuple) -> tuple[Bool[Array, ""], Bool[Array, ""]]:

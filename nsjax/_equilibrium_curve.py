@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ._curve import Curve
-from ._equilibrium import balance, free_eigenvalues, linear_motion, switch_values
+from ._equilibrium import all_decay, balance, free_eigenvalues, linear_motion, stacked_values, switch_values
 from ._filippov import Model, State
 from ._parameter import put_parameter
 from ._system import impact, relay, sgn
@@ -58,10 +58,6 @@ class EquilibriumCurve(Curve):
         system = put_parameter(self.model.system, self.path, value)
         return eqx.tree_at(lambda m: m.system, self.model, system), jfu.ravel_pytree(self.like)[1](x), sigma
 
-    def unknowns(self, y: Y, sigma: Array, value: Any) -> Array:
-        x = jfu.ravel_pytree(y)[0]
-        return jnp.concatenate([x, sigma, jnp.asarray(value - self.low, x.dtype)[None]]) / self.units
-
     def state(self, mode: Int[Array, "2 switches"]) -> State:
         several = [n > 1 and not isinstance(k, relay) for n, k in zip(self.model.parts, self.model.switches)]
         part = tuple(p if on else None for p, on in zip(mode[1], several))
@@ -83,10 +79,7 @@ class EquilibriumCurve(Curve):
         _, motion, held, attracts = linear_motion(model, self.t, y, state, values)
         x, _, value = self.parts(u)
         roots = free_eigenvalues(motion, held)
-        free = jnp.arange(len(x), dtype=held.dtype) < len(x) - held
-        stable = jnp.all(jnp.where(free, roots.real < 0, True)) & attracts
-        multipliers = jnp.stack([jnp.asarray(v, x.dtype) for v in values]) if values else jnp.zeros(0, x.dtype)
-        return Record(y, value, multipliers, roots, held, stable)
+        return Record(y, value, stacked_values(values, x.dtype), roots, held, all_decay(roots, held) & attracts)
 
     # Guards, switch by switch: the components of h, and their minimum if there are several; of one that can hold what
     # is left to the bounds of its value, and to ±1 if it holds beyond. Of a relay both surfaces.

@@ -44,11 +44,11 @@ def hopf_orbits(
         from those for the one before.
     - `sizes`: distances from the equilibrium to start from; by default nine from 0.03 to 3 times the first
         `distance`, which the orbits of a discontinuous bifurcation grow in proportion to, or its root, at a smooth one.
-    - `options`: as for `find_orbit`.
+    - `options`: as for `find_orbit`, which is given one try from each state.
 
     **Returns:** two lists of families of orbits, each with one orbit for every distance (up to where it is lost).
 
-    **Raises:** `ValueError` for a point that is no Hopf bifurcation.
+    **Raises:** `ValueError` for a point that is no Hopf bifurcation, or a `distance` that is not positive.
     """
     if bifurcation.period is None:
         raise ValueError(f"Argument `bifurcation` must be a Hopf bifurcation, but is: {bifurcation.name}.")
@@ -67,9 +67,11 @@ def hopf_orbits(
     for side, families in zip((-1, 1), found):
         model, at = beside(side, distances[0])
         families += [[orbit] for orbit in _around(model, at, bifurcation.period, sizes, options)]
-        for last, distance in zip(distances[:-1], distances[1:]):
+        for number, (last, distance) in enumerate(zip(distances[:-1], distances[1:]), 1):
             model, there = beside(side, distance)
-            for family in (family for family in families if last == distances[0] or len(family) > 1):
+            for family in families:
+                if len(family) < number:
+                    continue  # it was lost before
                 orbit = family[-1]
                 grown = ravel(there.y) + (distance / last) ** power * (ravel(orbit.y0) - ravel(at.y))
                 orbit = _found(model, jfu.ravel_pytree(at.y)[1](grown), orbit.period, options)
