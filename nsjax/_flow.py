@@ -21,7 +21,7 @@ from ._once import once
 from ._save import Log, Saved
 from ._solution import RESULTS
 from ._step import stack, Step, Stepper, unresolved, Watch
-from ._system import frozen
+from ._system import frozen, impact
 from ._types import Scalar, Y
 
 
@@ -206,6 +206,8 @@ class Flow(eqx.Module):
         t, y, f, state = choose(moved, new, (c.t, c.y, c.f, c.state))
         steps = c.steps + c.active.astype(jnp.int32)
         done = t >= self.t1
+        if any(k.ends for k in model.switches):
+            done = done | (event & there.news & self.ends(there))
         few = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(c.t)
         crawled = jnp.where(event | (step.step.t_next - c.t > few), 0, c.crawled + 1)
         result = RESULTS.where((crawled > 64) & ~done, RESULTS.dt_min_reached, result)
@@ -232,6 +234,17 @@ class Flow(eqx.Module):
             saved=self.save(c, there, moved, accepted),
             meter=self.meter.step(c.meter, jnp.where(active, (t - self.t0) / (self.t1 - self.t0), 1.0)),
         )
+
+    def ends(self, there: Landing) -> Bool[Array, ""]:
+        """Whether an event is one that ends the solution: of an impact, that is not a lift-off."""
+        last = jnp.zeros((), bool)
+        for i, slot in enumerate(self.model.slots):
+            switch = self.model.switches[slot.switch]
+            if switch.ends and not (slot.holding and isinstance(switch, impact)):
+                mode = there.state.mode[slot.switch]
+                wanted = jnp.stack([mode == value for value in switch.ends]).any()
+                last = last | ((there.slot == i) & wanted)
+        return last
 
     def save(self, c: Carry, there: Landing, moved: Bool[Array, ""], accepted: Int[Array, ""]) -> Saved:
         """What `saveat` asks for of this turn; at an event the states before and after it."""

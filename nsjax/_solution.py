@@ -61,6 +61,14 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "No equilibrium was found: Newton's method did not converge. Start nearer to one, give another `mode`, or "
         "check that the field vanishes anywhere."
     )
+    no_return = (
+        "The solution did not come back to the section within `max_time`. Give it more time, check `direction`, or "
+        "start where it does; a solution that comes to rest never returns."
+    )
+    reduced_map_not_found = (
+        "No state with this value of the component was found whose other components are periodic: Newton's method did "
+        "not converge. There may be none; or give another `guess`, such as the state found for a value nearby."
+    )
     orbit_not_found = (
         "No periodic orbit was found: Newton's method did not converge. Start nearer to one "
         "(`y0`, `period`), or check that the system has one."

@@ -23,7 +23,7 @@ from ._solution import Events, is_okay, raise_if, RESULTS, Solution
 from ._start import start_mode
 from ._step import RungeKutta, Stepper
 from ._structure import is_affine
-from ._system import arrays_of, System
+from ._system import arrays_of, frozen, System
 from ._taylor import Taylor, TaylorStepper
 from ._types import Scalar, Y
 
@@ -69,7 +69,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     model = Model(system, direction, start, y0)
     start = check_contacts(model, start, y0)
     max_events = max_events if model.slots else 0
-    state, forked, result = start_mode(model, start, y0, given)
+    state, forked, result = start_mode(model, start, y0, given, frozen(stop - start))
     stepper = _stepper(solver).made_for(model, state, start, y0)
     y0 = model.project(start, y0, state)  # a change of y0 off the surface that holds it changes nothing
     f0 = model.flow(start, y0, state)

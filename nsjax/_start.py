@@ -12,12 +12,17 @@ from ._system import frozen, impact, relay
 from ._types import Scalar, Y
 
 
-def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[State, Bool[Array, ""], RESULTS]:
+AT_ONCE = 0.01  # times the root of eps and of the time to be solved for: what is crossed sooner is where the start is
+
+
+def start_mode(
+    model: Model, t: Scalar, y: Y, given: dict[str, Any], horizon: Scalar
+) -> tuple[State, Bool[Array, ""], RESULTS]:
     """The mode in which the solution sets out: from the signs of h, from `mode=`, and on a surface by the fields; and
-    whether another solution sets out there too."""
+    whether another solution sets out there too. `horizon`: for how long it is to be solved."""
     modes, parts, roots, at = [], [], [], {}
     result = RESULTS.successful
-    on = {}
+    on, beyond = {}, {}
     for k, switch in enumerate(model.switches):
         zero = jnp.zeros((), jnp.int32)
         if isinstance(switch, relay):
@@ -36,9 +41,10 @@ def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[St
         parts.append(part.astype(jnp.int32) if model.parts[k] > 1 else None)
         roots.append(zero)
         if isinstance(switch, impact):
-            result = RESULTS.where(h < -noise, RESULTS.start_penetrates, result)
             rests = jnp.zeros((), bool)
-            if switch.name in given:
+            if switch.name not in given:
+                result = RESULTS.where(h < -noise, RESULTS.start_penetrates, result)
+            else:
                 if k not in model.contacts:
                     raise ValueError(
                         f"Argument `mode` must not name `{switch.name}`: this impact surface cannot hold the solution "
@@ -46,7 +52,9 @@ def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[St
                     )
                 at[k], rests = rests, jnp.asarray(given[switch.name]) == 1
                 result = RESULTS.where(rests & (h > 1e6 * noise), RESULTS.wrong_mode, result)
-            elif k in model.contacts:
+                beyond[k] = -h - 1e6 * noise
+                on[k] = h <= noise
+            if switch.name not in given and k in model.contacts:
                 still = State((), tuple(parts), ())
                 (slow,) = model.rounding(lambda t, y, k=k, still=still: (model.level(k, t, y, still),), t, y)
                 at[k] = rests = on[k] & (jnp.abs(model.level(k, t, y, still)) <= slow)
@@ -54,8 +62,7 @@ def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[St
         elif switch.name in given:
             mode = jnp.asarray(given[switch.name], jnp.int32)
             # A state taken from an earlier solution may carry some drift off its surface.
-            off = jnp.where(mode == 0, jnp.abs(h) > 1e6 * noise, mode.astype(h.dtype) * h < -1e6 * noise)
-            result = RESULTS.where(off, RESULTS.wrong_mode, result)
+            beyond[k] = jnp.where(mode == 0, jnp.abs(h), -mode.astype(h.dtype) * h) - 1e6 * noise
             modes.append(mode)
             at[k] = jnp.zeros((), bool)
             on[k] = mode.astype(h.dtype) * h <= noise
@@ -63,6 +70,12 @@ def start_mode(model: Model, t: Scalar, y: Y, given: dict[str, Any]) -> tuple[St
             modes.append(jnp.where(on[k], 0, jnp.sign(h)).astype(jnp.int32))
             at[k] = on[k]
     state = State(tuple(modes), tuple(parts), tuple(roots))
+    for k, gap in beyond.items():
+        # Near zero the rounding of h itself is nothing beside that of the terms which once led there.
+        soon = AT_ONCE * float(jnp.finfo(t.dtype).eps) ** 0.5 * horizon
+        off = gap > soon * jnp.abs(frozen(model.approach(k, t, y, state)))
+        failure = RESULTS.start_penetrates if isinstance(model.switches[k], impact) else RESULTS.wrong_mode
+        result = RESULTS.where(off, failure, result)
     forked = _forked(model, t, y, state, on)
     state, unsure, _, wrong = settle(model, t, y, state, at, {k: jnp.zeros((), jnp.int32) for k in at})
     for k in model.holdable:  # see `land`

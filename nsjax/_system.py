@@ -29,6 +29,7 @@ class AbstractSwitch:
 
     guard: Guard
     name: str
+    ends: tuple[int, ...] = ()  # where an event of this switch leads to one of these modes the solution ends
 
     def __init__(self, guard: Guard, *, name: str | None = None):
         if not callable(guard):
