@@ -3,7 +3,9 @@
 from . import gallery as gallery, plot as plot
 from ._bifurcation import Bifurcation as Bifurcation, HalfBranch as HalfBranch
 from ._branch import Branch as Branch
+from ._brute_force import brute_force as brute_force, BruteForce as BruteForce
 from ._continue_equilibrium import continue_equilibrium as continue_equilibrium
+from ._continue_orbit import continue_orbit as continue_orbit, OrbitGrowth as OrbitGrowth
 from ._crossings import (
     eigenvalue_crossings as eigenvalue_crossings,
     eigenvalue_path as eigenvalue_path,
@@ -23,7 +25,15 @@ from ._generalized import (
 from ._hopf_orbits import hopf_orbits as hopf_orbits
 from ._kinks import mark_kinks as mark_kinks
 from ._orbit import Orbit as Orbit
+from ._orbit_bifurcation import OrbitBifurcation as OrbitBifurcation, OrbitHalf as OrbitHalf
+from ._orbit_branch import OrbitBranch as OrbitBranch
 from ._pencil import EigenvalueCrossing as EigenvalueCrossing
+from ._poincare import (
+    Iterate as Iterate,
+    poincare_map as poincare_map,
+    stroboscopic_map as stroboscopic_map,
+)
+from ._reduced_map import reduced_map as reduced_map, ReducedIterate as ReducedIterate
 from ._regularise import banded as banded, smoothed as smoothed
 from ._saltation import (
     saltation_matrices as saltation_matrices,

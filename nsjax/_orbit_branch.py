@@ -1,0 +1,163 @@
+"""Branches of periodic orbits."""
+
+import dataclasses
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+from ._orbit_bifurcation import OrbitBifurcation
+from ._orbit_curve import OrbitCurve
+from ._orbit_trace import midpoint, Spot
+from ._system import System
+from ._types import Y
+
+
+CLOSED = "the start: it is closed"
+NOT_BIFURCATIONS = ("none", "end")
+
+
+class OrbitBranch(eqx.Module):
+    """A curve of periodic orbits over a parameter.
+
+    **Attributes:**
+
+    - `system`, `parameter`: the model, and the name of the parameter.
+    - `values`: of the parameter, at each point.
+    - `periods`: of the orbits [time]. `orders`: over that of the forcing; ones if there is none.
+    - `ts`, `ys`: a time, and the state of each orbit then, away from events and from where it sticks; leaves with a
+        leading axis.
+    - `low`, `high`, `mean`: of each component of the state along the orbit, in the structure of `ys`.
+    - `multipliers`: shape `(points, n)`, largest modulus first; infinite on orbits that are infinitely unstable.
+    - `stable`: whether all but the trivial one are inside the unit circle.
+    - `itineraries`: the modes that each orbit passes through, as text.
+    - `special`: the special points on it, in their order.
+    - `indices`: at which point of the branch each is. A corner is there with the limits of its multipliers from both
+        sides, at `indices` and the point after.
+    - `ends`: why it begins and ends where it does.
+    - `others`: the other branches that were found, on the one that `continue_orbit` returns.
+    """
+
+    system: System
+    parameter: str
+    values: Float[np.ndarray, " points"]
+    periods: Float[np.ndarray, " points"]
+    orders: Int[np.ndarray, " points"]
+    ts: Float[np.ndarray, " points"]
+    ys: Y
+    low: Y
+    high: Y
+    mean: Y
+    multipliers: Complex[np.ndarray, "points n"]
+    stable: Bool[np.ndarray, " points"]
+    itineraries: tuple[str, ...]
+    special: tuple[OrbitBifurcation, ...]
+    indices: tuple[int, ...]
+    ends: tuple[str, str]
+    others: "tuple[OrbitBranch, ...]" = ()
+
+    @property
+    def branches(self) -> "tuple[OrbitBranch, ...]":
+        """This one and the others."""
+        return (self, *self.others)
+
+    @property
+    def special_points(self) -> tuple[OrbitBifurcation, ...]:
+        """Those of all branches, each once, in the order of the parameter."""
+        found: dict[int, OrbitBifurcation] = {}
+        for branch in self.branches:
+            found |= {id(b): b for b in branch.special}
+        return tuple(sorted(found.values(), key=lambda b: b.value))
+
+    @property
+    def bifurcations(self) -> tuple[OrbitBifurcation, ...]:
+        """Those of them that are bifurcations."""
+        return tuple(b for b in self.special_points if b.kind not in NOT_BIFURCATIONS)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __str__(self) -> str:
+        lines = [f"{len(self.branches)} {'branches' if self.others else 'branch'} of periodic orbits of "
+                 f"{type(self.system).__name__}"]  # fmt: skip
+        seen: list[Any] = []
+        for branch in self.branches:
+            low, high = float(np.min(branch.values)), float(np.max(branch.values))
+            words = ["stable" if s else "unstable" for s in branch.stable]
+            runs = [word for i, word in enumerate(words) if i == 0 or words[i - 1] != word]
+            told = ", then ".join(runs) if len(runs) <= 6 else f"{len(runs) - 1} changes of stability"
+            order = int(branch.orders[0])
+            period = f"period {order}, " if branch.system.period is not None else ""
+            lines.append(f"  {period}{self.parameter} in [{low:.6g}, {high:.6g}]: {len(branch)} points, {told}")
+            lines.append(f"    from {branch.ends[0]} to {branch.ends[1]}")
+            for special in branch.special:
+                known = any(special is other for other in seen)
+                lines += [f"    {line}" for line in str(special).splitlines()[: 1 if known else None]]
+                seen.append(special)
+        return "\n".join(lines)
+
+
+@dataclasses.dataclass
+class OrbitStrand:
+    """Points one after the other, and the special ones among them, while they are found."""
+
+    spots: list[tuple[Spot, int]] = dataclasses.field(default_factory=list)  # with their order
+    special: list[tuple[int, OrbitBifurcation]] = dataclasses.field(default_factory=list)
+    end: str = ""
+
+    def reversed(self) -> "OrbitStrand":
+        last = len(self.spots) - 1
+
+        def index(i: int) -> int:
+            """Of a corner that is there twice, the first of the two."""
+            twice = i < last and math.isclose(self.spots[i + 1][0].parameter, self.spots[i][0].parameter, rel_tol=1e-10)
+            return last - i - 1 if twice else last - i
+
+        return OrbitStrand(self.spots[::-1], [(index(i), b) for i, b in self.special[::-1]], self.end)
+
+
+def orbit_branch(
+    curve: OrbitCurve, system: System, parameter: str, back: OrbitStrand, ahead: OrbitStrand, itinerary: Any
+) -> OrbitBranch:
+    """Two strands that set out from one point as one branch: upwards, if there is a choice."""
+    ends = (back.end, ahead.end)
+    turned = back.reversed()
+    keep = len(turned.spots)
+    common = bool(turned.special and ahead.special) and turned.special[-1][1] is ahead.special[0][1]
+    if keep and ahead.spots and turned.spots[-1][0] is ahead.spots[0][0] and not common:
+        keep -= 1
+    strand = OrbitStrand(turned.spots[:keep] + ahead.spots)
+    strand.special = [(i, b) for i, b in turned.special if i < keep]
+    strand.special += [(i + keep, b) for i, b in ahead.special if not (common and i == 0)]
+    if strand.spots[0][0].parameter > strand.spots[-1][0].parameter:
+        strand, ends = strand.reversed(), ends[::-1]
+    spots = [spot for spot, _ in strand.spots]
+    unravel = jfu.ravel_pytree(curve.like)[1]
+
+    def column(rows: list[np.ndarray]) -> Any:
+        return jax.tree.map(np.asarray, jax.vmap(unravel)(np.stack(rows)))
+
+    bases = [midpoint(curve, spot, spot.course.rows) for spot in spots]
+    texts: dict[int, str] = {}
+    return OrbitBranch(
+        system=system,
+        parameter=parameter,
+        values=np.array([spot.parameter for spot in spots]),
+        periods=np.array([float(spot.look.period) for spot in spots]),
+        orders=np.array([order for _, order in strand.spots]),
+        ts=np.array([t for t, _, _ in bases]),
+        ys=column([x for _, x, _ in bases]),
+        low=column([spot.look.low for spot in spots]),
+        high=column([spot.look.high for spot in spots]),
+        mean=column([spot.look.mean for spot in spots]),
+        multipliers=np.stack([np.asarray(spot.multipliers, complex) for spot in spots]),
+        stable=np.array([spot.stable for spot in spots]),
+        itineraries=tuple(texts.setdefault(id(s.course), itinerary(curve, s.course)) for s in spots),
+        special=tuple(b for _, b in strand.special),
+        indices=tuple(i for i, _ in strand.special),
+        ends=ends,
+    )

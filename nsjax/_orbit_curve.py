@@ -1,0 +1,511 @@
+"""The curve on which the periodic orbits of one course lie when a parameter varies.
+
+The states and times of all events are unknown. So the curve is smooth where the return map is not: at grazing, where a
+segment has no length, and on surfaces that repel.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ._arcs import Smooth
+from ._course import Course, EVENT, FREE, LEAST, Start, TIME
+from ._cuts import landing
+from ._filippov import Model, State
+from ._floquet import floquet, structural_zeros
+from ._implicit import find_root
+from ._parameter import put_parameter
+from ._solution import is_okay
+from ._solve import solve
+from ._system import relay, System
+from ._types import Scalar, Y
+
+
+NODES = 64  # at which the guards of a segment are looked at
+TOLERANCE = 1e-12
+
+
+class _Varied(System):
+    """A state, the parameter, and the derivatives of the state by those at the beginning, in one mode."""
+
+    model: Model
+    path: tuple[str, ...] = eqx.field(static=True)
+    state: State
+
+    def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
+        y, value, columns = y
+
+        def rhs(y: Y, value: Scalar) -> Y:
+            return with_parameter(self.model, self.path, value).flow(t, y, self.state)
+
+        along, moved = columns
+        change = jax.vmap(lambda dy, dv: jax.jvp(rhs, (y, value), (dy, dv))[1])(along, moved)
+        return rhs(y, value), jnp.zeros_like(value), (change, jnp.zeros_like(moved))
+
+
+class _Summed(System):
+    """The field of one mode, for one value of the parameter; and the integrals of the state and of its squares."""
+
+    model: Model
+    path: tuple[str, ...] = eqx.field(static=True)
+    value: Scalar
+    state: State
+
+    def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
+        y, _, _ = y
+        return with_parameter(self.model, self.path, self.value).flow(t, y, self.state), y, jax.tree.map(jnp.square, y)
+
+
+def with_parameter(model: Model, path: tuple[str, ...], value: Scalar) -> Model:
+    return eqx.tree_at(lambda m: m.system, model, put_parameter(model.system, path, value))
+
+
+class Look(NamedTuple):
+    """All that is seen of a point of the curve.
+
+    - `u`, `tangent`: the unknowns, and the direction of the curve; `good`: whether it is a point of the curve.
+    - `parameter`, `period`; `begin`, `end`, `x`, `last`: of the segments: times, and states at beginnings and ends.
+    - `factors`: the derivatives from the beginning of each segment to that of the next, at the same time; `monodromy`,
+        `multipliers`, `stable`: what follows.
+    - `rates`: of the guard that ends each segment, there: negative unless it comes to its surface tangentially.
+    - `ends`: value of that guard there.
+    - `margins`: |λ| - b at events that cross a surface which could hold.
+    - `least`, `where`, `most`, `spots`: of each segment and guard the least value, without the zeros that it has at the
+        ends; at which share of the segment; the largest value; and the state where it is least.
+    - `low`, `high`: the least and the largest value of each component of the state; `mean`, `square`: its mean and that
+        of its square over time.
+    - `branch`: sign and logarithm of the determinant of the equations bordered by the tangent.
+    - `residual`: the largest of the equations.
+    """
+
+    u: Array
+    tangent: Array
+    good: Bool[Array, ""]
+    parameter: Scalar
+    period: Scalar
+    begin: Array
+    end: Array
+    x: Array
+    last: Array
+    factors: Array
+    monodromy: Array
+    multipliers: Array
+    stable: Bool[Array, ""]
+    rates: Array
+    ends: Array
+    margins: Array
+    least: Array
+    where: Array
+    most: Array
+    spots: Array
+    low: Array
+    high: Array
+    mean: Array
+    square: Array
+    branch: Array
+    residual: Scalar
+
+
+class OrbitCurve(eqx.Module):
+    """The equations; what is unknown is measured in `sizes` (state), `time`, and `width`, the interval of the parameter
+    from `low` on."""
+
+    model: Model
+    path: tuple[str, ...] = eqx.field(static=True)
+    like: Y
+    low: Scalar
+    width: Scalar
+    sizes: Float[Array, " n"]
+    time: Scalar
+    guard_sizes: Float[Array, " slots"]  # what a unit of the unknowns makes of each guard
+    order: Int[Array, ""]  # periods of the forcing
+    normal: Float[Array, " n"]  # the phase condition of an autonomous orbit without events
+    reference: Float[Array, " n"]
+    how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+
+    @property
+    def autonomous(self) -> bool:
+        return self.model.system.period is None
+
+    def unravel(self, x: Array) -> Y:
+        return jfu.ravel_pytree(self.like)[1](x)
+
+    def parts(self, u: Array) -> tuple[Array, Array, Array, Scalar]:
+        """Times of beginning and end, states at the beginnings, parameter."""
+        n = len(self.sizes)
+        rows = (len(u) - 1) // (n + 2)
+        z = u[:-1].reshape(rows, n + 2)
+        return z[:, 0] * self.time, z[:, 1] * self.time, z[:, 2:] * self.sizes, self.low + u[-1] * self.width
+
+    def pack(self, start: Start, value: Any) -> Array:
+        capacity, n = len(start.course.slot), len(self.sizes)
+        z = np.zeros((capacity, n + 2))
+        for i in range(capacity):
+            j = min(i, len(start.begin) - 1)
+            z[i] = [start.begin[j], start.end[j], *start.x[j]]
+            if i > j:
+                z[i, :2] = start.end[j]
+        z /= np.array([float(self.time)] * 2 + np.asarray(self.sizes).tolist())
+        return jnp.append(jnp.asarray(z).ravel(), (jnp.asarray(value) - self.low) / self.width)
+
+    def state(self, mode: Array, part: Array) -> State:
+        model = self.model
+        several = [n > 1 and not isinstance(k, relay) for n, k in zip(model.parts, model.switches)]
+        parts = tuple(p if on else None for p, on in zip(part, several))
+        return State(tuple(mode), parts, tuple(jnp.zeros((), jnp.int32) for _ in model.switches))
+
+    def guards(self, model: Model, t: Scalar, x: Array, state: State) -> Float[Array, "slots parts"]:
+        return model.stacked(model.guards(t, self.unravel(x), state), -jnp.inf)
+
+    def guard(self, model: Model, t: Scalar, x: Array, state: State, slot: Array, entry: Array) -> Scalar:
+        if not model.slots:
+            return jnp.ones_like(t)
+        return self.guards(model, t, x, state)[slot, entry]
+
+    def rate(self, model: Model, t: Scalar, x: Array, state: State, slot: Array, entry: Array) -> Scalar:
+        """How fast a guard changes along the flow."""
+        f = jfu.ravel_pytree(model.flow(t, self.unravel(x), state))[0]
+        along = jax.jvp(lambda t, x: self.guard(model, t, x, state, slot, entry), (t, x), (jnp.ones_like(t), f))
+        return along[1]
+
+    def residual(self, u: Array, course: Course, origin: Array) -> tuple[Array, Scalar, Array]:
+        """What vanishes: for each segment its beginning in time and state, and what ends it. Also the time at which the
+        last segment ends, and the states at the ends."""
+        begin, end, x, value = self.parts(u)
+        rows = len(begin)
+        model = with_parameter(self.model, self.path, value)
+        index = jnp.arange(rows, dtype=course.num.dtype)
+        happened, final = index < course.num, index == course.num - 1
+        mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
+        following = jnp.where(final[:, None], mode[:1], jnp.roll(mode, -1, axis=0))
+
+        def row(a: Scalar, b: Scalar, x: Array, mode: Array, part: Array) -> Array:
+            return _arrive(self.model, self.path, self.how, self.like, a, b, x, value, self.state(mode, part))
+
+        last = jax.vmap(row)(begin, end, x, mode, part)
+
+        def jump(t: Scalar, x: Array, mode: Array, part: Array, after: Array, slot: Array, ends: Array) -> tuple:
+            out = (self.unravel(x), jnp.zeros_like(t))
+            if model.contacts or any(model.switches[k].__class__.__name__ == "impact" for k in range(len(model.parts))):
+                switch = jnp.asarray([s.switch for s in model.slots], jnp.int32)[slot]
+                k = jnp.where(ends == EVENT, switch, -1)
+                out = landing(model, k, t, self.unravel(x), self.state(mode, part), tuple(after))
+            return jfu.ravel_pytree(out[0])[0], out[1]
+
+        after, rest = jax.vmap(jump)(end, last, mode, part, following, course.slot, course.ends)
+        before = jnp.where(index == 0, course.num - 1, index - 1)
+        forced = None if self.autonomous else jnp.asarray(model.system.period, end.dtype) * self.order.astype(end.dtype)
+        arrival = (end + rest)[before]
+        anchor = jnp.zeros_like(end[0]) if forced is None else arrival[0] - forced
+        if not self.autonomous:
+            anchor = jnp.where(course.ends[0] == TIME, lax.stop_gradient(origin[0] * self.time), anchor)
+        started = begin - jnp.where(index == 0, anchor, arrival)
+
+        def ended(a: Scalar, b: Scalar, x: Array, last: Array, mode: Array, part: Array, *what: Array) -> Scalar:
+            slot, entry, ends = what
+            state = self.state(mode, part)
+            out = self.guard(model, b, last, state, slot, entry)
+            out = jnp.where(ends == LEAST, self.rate(model, b, last, state, slot, entry) * self.time, out)
+            if model.holdable and model.slots:
+                holding = self.guard(model, a, x, state, slot, entry) + 1
+                for k in model.holdable:
+                    if k not in model.contacts:
+                        here = jnp.asarray([s.switch == k for s in model.slots])[slot]
+                        holding = jnp.where(here, holding - model.bound(k), holding)
+                out = jnp.where(ends == FREE, holding, out)
+            out = out / (self.guard_sizes[slot] if model.slots else 1)
+            closing = self.normal @ (x - self.reference) if forced is None else b - a - forced
+            return jnp.where(ends == TIME, closing, out)
+
+        finish = jax.vmap(ended)(begin, end, x, last, mode, part, course.slot, course.entry, course.ends)
+        # In the units of the unknowns.
+        whole = jnp.concatenate([started[:, None] / self.time, finish[:, None], (x - after[before]) / self.sizes], 1)
+        fill = (u - lax.stop_gradient(origin))[:-1].reshape(rows, -1)
+        return jnp.where(happened[:, None], whole, fill).ravel(), arrival[0] / self.time, last
+
+    def look(self, u: Array, border: Array, course: Course, origin: Array, good: Array) -> Look:
+        begin, end, x, value = self.parts(u)
+        n, rows = len(self.sizes), len(begin)
+        model = with_parameter(self.model, self.path, value)
+
+        def equations(u: Array) -> tuple[tuple[Array, Scalar], tuple[Array, Array]]:
+            f, arrival, last = self.residual(u, course, origin)
+            return (f, arrival), (f, last)
+
+        (df, closing), (f, last) = jax.jacfwd(equations, has_aux=True)(u)
+        scaled = df / _row_sizes(df)[:, None]
+        whole = jnp.concatenate([scaled, border[None]])
+        tangent = jnp.linalg.solve(whole, jnp.zeros_like(u).at[-1].set(1))
+        tangent = tangent / jnp.linalg.norm(tangent)
+        branch = jnp.stack(jnp.linalg.slogdet(jnp.concatenate([df, tangent[None]])))
+
+        # Derivatives from segment to segment at the same time: the blocks of DF, the moved times eliminated.
+        index = jnp.arange(rows, dtype=course.num.dtype)
+        after = jnp.where(index >= course.num - 1, 0, index + 1)
+        mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
+        field = (
+            jax.vmap(lambda t, x, m, p: jfu.ravel_pytree(model.flow(t, self.unravel(x), self.state(m, p)))[0])(
+                begin, x, mode, part
+            )
+            * self.time
+            / self.sizes
+        )
+        blocks = df[:, :-1].reshape(rows, n + 2, rows, n + 2)
+        own, on = blocks[index, :, index], blocks[after, :, index]
+        # The next segment of the last one begins where it ends; of a single one it is the same.
+        itself = jnp.zeros(n + 2, u.dtype).at[2:].set(1)
+        on = jnp.where(course.num == 1, on - jnp.diag(itself), on)
+        final = (index == course.num - 1)[:, None]
+        on = on.at[:, 0].set(jnp.where(final, -closing[:-1].reshape(rows, n + 2), on[:, 0]))
+        on = jnp.where((course.ends == TIME)[:, None, None], on.at[:, 0].set(0), on)
+
+        def factor(own: Array, on: Array, ends: Array, last_field: Array) -> Array:
+            # Unknown of a segment: begin, end, x. Its equations: started, finished, continued.
+            by_x, by_end = own[1, 2:], own[1, 1]
+            slope = jnp.where(ends == EVENT, by_end, 1)
+            move = jnp.where(ends == EVENT, -by_x / slope, 0)  # of the end of the segment
+            shift = -(on[0, 1] * move + on[0, 2:])  # of the beginning of the next
+            plain = -(on[2:, 2:] + jnp.outer(on[2:, 1], move))
+            return plain - jnp.outer(last_field, shift)
+
+        factors = jax.vmap(factor)(own, on, course.ends, field[after])
+        factors = factors * self.sizes[:, None] / self.sizes[None, :]
+        factors = jnp.where((index < course.num)[:, None, None], factors, jnp.eye(n, dtype=u.dtype))
+
+        zeros = structural_zeros(model.system, jnp.where((index < course.num)[:, None], mode, mode[:1]))
+        found = floquet(factors, zeros, self.autonomous)
+
+        # Along the way.
+        theta = jnp.asarray(0.5 - 0.5 * np.cos(np.pi * np.arange(NODES + 1) / NODES), u.dtype)
+
+        def path(a: Scalar, b: Scalar, x: Array, mode: Array, part: Array) -> tuple[Array, Array, Array]:
+            summed = _Summed(self.model, self.path, value, self.state(mode, part))
+            span = jnp.abs(b - a)
+            ts = jnp.clip(a + (b - a) * theta, jnp.minimum(a, b), jnp.maximum(a, b))
+            # Of a segment without length every point is its beginning.
+            far = jnp.where(span > 0, b, a + 1e-9 * self.time)
+            save = jnp.where(span > 0, ts, a)
+            none = jax.tree.map(jnp.zeros_like, self.like)
+            saveat = dfx.SaveAt(subs=dfx.SubSaveAt(ts=save, fn=lambda t, y, args: y[0]))
+            sol = solve(summed, a, far, (self.unravel(x), none, none), saveat=saveat, throw=False, **dict(self.how))
+            sums = jnp.stack([jfu.ravel_pytree(part)[0] for part in sol.y1[1:]])
+            return ts, jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys), jnp.where(span > 0, sums, 0)
+
+        ts, xs, sums = jax.vmap(path)(begin, end, x, mode, part)
+        inside = (index < course.num)[:, None]
+        low, high = -_largest(theta, -xs, inside), _largest(theta, xs, inside)
+        length = jnp.sum(jnp.where(inside[:, 0], end - begin, 0))
+        mean, square = jnp.sum(jnp.where(inside[..., None], sums, 0), axis=0) / length
+        period = end[course.num - 1] - begin[0]
+        if not self.autonomous:
+            period = jnp.asarray(model.system.period, u.dtype) * self.order.astype(u.dtype)
+        least, most, index = self._least(model, theta, ts, xs, course)
+        where, spots = theta[index], jnp.take_along_axis(xs, index[..., None], axis=1)
+        rates, values, margins = self._at_ends(model, end, last, course)
+        return Look(
+            u, tangent, good & jnp.all(jnp.isfinite(tangent)), value, period, begin, end, x, last, factors, *found,
+            rates, values, margins, least, where, most, spots, low, high, mean, square, branch, jnp.max(jnp.abs(f)),
+        )  # fmt: skip
+
+    def _least(
+        self, model: Model, theta: Array, ts: Array, xs: Array, course: Course
+    ) -> tuple[Float[Array, "rows slots"], Float[Array, "rows slots"], Int[Array, "rows slots"]]:
+        """Of every guard in every segment the least value, divided by the zeros that it must have at the ends; the
+        largest; and at which node it is least."""
+        rows = len(ts)
+        if not model.slots:
+            none = jnp.ones((rows, 0), ts.dtype)
+            return none, none, jnp.zeros((rows, 0), jnp.int32)
+        mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
+
+        def row(ts: Array, xs: Array, m: Array, p: Array) -> Array:
+            state = self.state(m, p)
+            return jax.vmap(lambda t, x: jnp.max(self.guards(model, t, x, state), axis=-1))(ts, xs)
+
+        values = jax.vmap(row)(ts, xs, mode, part)  # rows, nodes, slots
+        zeros = jnp.asarray(self.zeros_at_begin(model, course), values.dtype)  # rows, slots
+        here = jnp.arange(values.shape[-1], dtype=course.slot.dtype) == course.slot[:, None]
+        index = jnp.arange(rows, dtype=course.num.dtype)
+        after = jnp.where(index >= course.num - 1, 0, index + 1)
+        # On what is left freely it comes tangentially.
+        last = jnp.where(
+            (course.ends == EVENT)[:, None] & here, jnp.where(course.ends[after] == FREE, 2, 1)[:, None], 0
+        )
+        below = theta[None, :, None] ** zeros[:, None, :]
+        below = below * (1 - theta[None, :, None]) ** last[:, None, :].astype(theta.dtype)
+        ok = below > 0
+        # A node beside a zero is rounding divided by little.
+        deflated = jnp.where(ok & (below > 1e-9), values / jnp.where(ok, below, 1), jnp.inf)
+        index = jnp.argmin(deflated, axis=1)
+        return jnp.min(deflated, axis=1), jnp.max(values, axis=1), index
+
+    def zeros_at_begin(self, model: Model, course: Course) -> Array:
+        """How many zeros each guard has at the beginning of each segment: that of the surface just left."""
+        index = jnp.arange(len(course.slot), dtype=course.num.dtype)
+        before = jnp.where(index == 0, course.num - 1, index - 1)
+        slot, ends, mode_before = course.slot[before], course.ends[before], jnp.asarray(course.mode)[before]
+        mode = jnp.asarray(course.mode)
+        columns = []
+        switch = jnp.asarray([s.switch for s in model.slots], jnp.int32)[slot]
+        entry = course.entry[before]
+        part = jnp.asarray([s.part for s in model.slots], jnp.int32)[slot]
+        component = jnp.where(entry > 0, entry, jnp.where(part >= 0, part, 0))
+        for s in model.slots:
+            k = s.switch
+            left = (switch == k) & ((ends == EVENT) | (ends == FREE))
+            if s.holding or isinstance(model.switches[k], relay):
+                columns.append(jnp.zeros(len(index)))
+                continue
+            free = jnp.ones(len(index), bool)
+            order = jnp.ones(len(index))
+            if k in model.holdable:
+                held = 1 if k in model.contacts else 0
+                free = mode[:, k] != held
+                slid = mode_before[:, k] == held
+                if k in model.contacts:
+                    order = jnp.where(slid, 3, 1)
+                elif not model.static(k):
+                    order = jnp.where(slid, 2, 1)
+            if model.parts[k] > 1:  # above, each component is a guard of its own; below, they are one
+                free = free & jnp.where(mode[:, k] > 0, component == s.part, s.part == 0)
+            columns.append(jnp.where(left & free, order, 0))
+        return jnp.stack([c.astype(jnp.result_type(float)) for c in columns], axis=1)
+
+    def _at_ends(self, model: Model, end: Array, last: Array, course: Course) -> tuple[Array, Array, Array]:
+        """Rate and value of the guard that ends each segment, and |λ| - b where it crosses what could hold it."""
+        if not model.slots:
+            return -jnp.ones_like(end), jnp.zeros_like(end), jnp.ones_like(end)
+        mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
+        final = jnp.arange(len(end), dtype=course.num.dtype) == course.num - 1
+        following = jnp.where(final[:, None], mode[:1], jnp.roll(mode, -1, axis=0))
+
+        def row(t: Scalar, x: Array, m: Array, p: Array, after: Array, slot: Array, entry: Array) -> tuple:
+            state = self.state(m, p)
+            margin = jnp.full_like(t, jnp.inf)
+            for k in model.holdable:
+                if k in model.contacts:
+                    continue
+                here = jnp.asarray([s.switch == k for s in model.slots])[slot] & (m[k] != 0) & (after[k] != 0)
+                held = state._replace(mode=tuple(jnp.where(i == k, 0, mi) for i, mi in enumerate(state.mode)))
+                if model.parts[k] > 1:
+                    touched = jnp.where(entry > 0, entry, jnp.asarray([s.part for s in model.slots], jnp.int32)[slot])
+                    held = held._replace(part=tuple(touched if i == k else q for i, q in enumerate(held.part)))
+                value = model.values(t, self.unravel(x), held)[k]
+                margin = jnp.where(here, jnp.abs(value) - model.bound(k), margin)
+            rate = self.rate(model, t, x, state, slot, entry)
+            return rate, self.guard(model, t, x, state, slot, entry), margin
+
+        return jax.vmap(row)(end, last, mode, part, following, course.slot, course.entry)
+
+
+def guard_sizes(curve: OrbitCurve, start: Start) -> np.ndarray:
+    """What a unit of the unknowns makes of each guard: from their gradients at the beginnings of the segments."""
+
+    @jax.jit
+    def sizes(t: Scalar, x: Array, mode: Array, part: Array) -> Array:
+        state = curve.state(mode, part)
+        by_t, by_x = jax.jacfwd(lambda t, x: curve.guards(curve.model, t, x, state), argnums=(0, 1))(t, x)
+        both = jnp.concatenate([by_t[..., None] * curve.time, by_x * curve.sizes], axis=-1)
+        return jnp.max(jnp.where(jnp.isfinite(both), jnp.abs(both), 0), axis=(-2, -1))
+
+    if not curve.model.slots:
+        return np.zeros(0)
+    rows = start.course.rows
+    seen = [sizes(start.begin[i], start.x[i], start.course.mode[i], start.course.part[i]) for i in rows]
+    # Those of a switch that is held are seen in that mode alone.
+    every = np.stack([np.ones(len(curve.model.switches), np.int32) * m for m in (-1, 0, 1)])
+    seen += [sizes(start.begin[0], start.x[0], mode, start.course.part[0]) for mode in every]
+    found = np.max(np.abs(np.asarray(seen)), axis=0)
+    return np.where(np.isfinite(found) & (found > 0), found, 1.0)
+
+
+def _largest(theta: Array, xs: Array, inside: Array) -> Array:
+    """The largest value of each component, by the parabola through the largest sample and its neighbours."""
+    here = jnp.where(inside[..., None], xs, -jnp.inf)
+    peak = jnp.clip(jnp.argmax(here, axis=1), 1, len(theta) - 2)  # rows, components
+    a, b, c = (jnp.take_along_axis(xs, (peak + k)[:, None], axis=1)[:, 0] for k in (-1, 0, 1))
+    ta, tb, tc = (theta[peak + k] for k in (-1, 0, 1))
+    left, right = (b - a) / (tb - ta), (c - b) / (tc - tb)
+    bend = (right - left) / (tc - ta)
+    safe = jnp.where(bend < 0, bend, -1)
+    at = jnp.clip((ta + tb) / 2 - left / (2 * safe), ta, tc)
+    top = a + left * (at - ta) + bend * (at - ta) * (at - tb)
+    best = jnp.maximum(jnp.max(here, axis=1), jnp.where(bend < 0, top, -jnp.inf))
+    return jnp.max(jnp.where(inside, best, -jnp.inf), axis=0)
+
+
+def _row_sizes(df: Array) -> Array:
+    sizes = jnp.max(jnp.abs(df), axis=1)
+    return jnp.where(sizes == 0, 1, sizes)
+
+
+@eqx.filter_custom_jvp
+def _arrive(model: Any, path: Any, how: Any, like: Any, a: Any, b: Any, x: Any, value: Any, state: Any) -> Array:
+    """The state at time b of the flow in one mode from `x` at time a."""
+    unravel = jfu.ravel_pytree(like)[1]
+    smooth = Smooth(with_parameter(model, path, value), state)
+    sol = solve(smooth, a, b, unravel(x), saveat=dfx.SaveAt(t1=True), throw=False, **dict(how))
+    return jnp.where(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0], jnp.nan)
+
+
+@_arrive.def_jvp
+def _arrive_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    """By the variational equation; by the times exactly, as the flow knows no beginning."""
+    model, path, how, like, a, b, x, value, state = primals
+    *_, da, db, dx, dvalue, _ = tangents
+    unravel = jfu.ravel_pytree(like)[1]
+    n = len(x)
+    eye = jnp.eye(n + 1, dtype=x.dtype)
+    columns = (jax.vmap(unravel)(eye[:, :n]), eye[:, n])
+    varied = _Varied(model, path, state)
+    sol = solve(varied, a, b, (unravel(x), value, columns), saveat=dfx.SaveAt(t1=True), throw=False, **dict(how))
+    y, _, (along, _) = sol.y1
+    end = jnp.where(is_okay(sol.result), jfu.ravel_pytree(y)[0], jnp.nan)
+    phi = jax.vmap(lambda c: jfu.ravel_pytree(c)[0], out_axes=1)(along)
+    here = with_parameter(model, path, value)
+    out = jnp.zeros_like(x)
+    if db is not None:
+        out = out + jfu.ravel_pytree(here.flow(b, y, state))[0] * db
+    if dx is not None:
+        out = out + phi[:, :n] @ dx
+    if da is not None:
+        out = out - phi[:, :n] @ jfu.ravel_pytree(here.flow(a, unravel(x), state))[0] * da
+    if dvalue is not None:
+        out = out + phi[:, n] * dvalue
+    return end, out
+
+
+@eqx.filter_jit
+def advance(
+    curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array, newton: Array | bool = True
+) -> Look:
+    """The point of the curve at the distance `s` from `origin` along `border`, and all that is seen of it; or, without
+    `newton`, of the guess itself."""
+
+    def residual(u: Array, _: Any) -> Array:
+        off = jnp.append(curve.residual(u, course, origin)[0], border @ (u - origin) - s)
+        return jnp.where(newton, off, u - guess)
+
+    u, good = find_root(residual, guess, None, TOLERANCE, 10)
+    return curve.look(u, border, course, origin, good)
+
+
+@eqx.filter_jit
+def state_at(curve: OrbitCurve, value: Scalar, a: Scalar, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
+    """The state at a time in a segment. (Between steps the states of a `Look` are those of the solver's dense output,
+    less exact than the steps.)"""
+    return _arrive(curve.model, curve.path, curve.how, curve.like, a, t, x, value, curve.state(mode, part))
+
+
+@eqx.filter_jit
+def linearised(curve: OrbitCurve, course: Course, u: Array) -> Array:
+    """The derivatives of the equations, row by row of size one."""
+    df = jax.jacfwd(lambda v: curve.residual(v, course, u)[0])(u)
+    return df / _row_sizes(df)[:, None]

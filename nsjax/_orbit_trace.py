@@ -1,0 +1,341 @@
+"""Along a branch of periodic orbits in one course, to the next point at which others may meet it."""
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from scipy.optimize import toms748
+
+from ._course import Course, EVENT, FREE, LEAST
+from ._orbit_curve import advance, Look, OrbitCurve, state_at
+
+
+FIRST, SHORTEST = 1e-3, 1e-9  # steps, in units of the curve
+TURN = 0.15  # the angle between tangents that is aimed at
+NEAR = 1e-5  # zeros that are nearer to each other, in steps, are one
+VANISHES = 1e-6  # a test function that is smaller, where another one vanishes
+SAME = 1e-6  # two orbits at one parameter that are nearer are one
+PASSED = ("fold", "flip", "Neimark-Sacker")  # bifurcations through which the branch goes on as it is
+CORNERS = ("duration", "margin", "rate", "guard")  # in the order in which what vanishes together is told by the first
+
+
+class Test(NamedTuple):
+    """A function whose zero is looked for: what it is, of which segment, and of which guard."""
+
+    kind: str
+    row: int = 0
+    slot: int = 0
+
+
+@dataclasses.dataclass
+class Spot:
+    """A point of a branch: what is seen there, its course, and its multipliers."""
+
+    look: Look
+    course: Course
+    multipliers: np.ndarray
+    stable: bool
+    monodromy: np.ndarray
+
+    @property
+    def parameter(self) -> float:
+        return float(self.look.parameter)
+
+    def trivial(self, autonomous: bool) -> np.ndarray:
+        """The multipliers without that of a shift along an autonomous orbit."""
+        finite = np.where(np.isfinite(self.multipliers), np.abs(self.multipliers - 1), np.inf)
+        return np.delete(self.multipliers, np.argmin(finite)) if autonomous else self.multipliers
+
+
+def spot_of(curve: OrbitCurve, look: Look, course: Course) -> Spot:
+    look = jax.device_get(look)
+    if FREE in course.ends[: int(course.num)]:
+        return _infinitely_unstable(curve, look, course)
+    return Spot(look, course, look.multipliers, bool(look.stable), look.monodromy)
+
+
+def _infinitely_unstable(curve: OrbitCurve, look: Look, course: Course) -> Spot:
+    n = len(curve.sizes)
+    rest = [1.0] * curve.autonomous + [np.nan] * (n - 1 - curve.autonomous)
+    return Spot(look, course, np.array([np.inf, *rest], complex), False, np.full((n, n), np.inf))
+
+
+def midpoint(curve: OrbitCurve, spot: Spot, rows: Iterable[int]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Time, state and mode in the middle of the longest of some segments, if possible one that no surface holds: beside
+    it orbits are near each other, as they need not be beside an event or where static friction holds."""
+    look, course = spot.look, spot.course
+    length = {}
+    for i in rows:
+        held = any(course.mode[i, k] == (1 if k in curve.model.contacts else 0) for k in curve.model.holdable)
+        length[i] = (look.end[i] - look.begin[i]) * (1e-6 if held else 1.0)
+    best = next(i for i in length if length[i] >= (1 - 1e-6) * max(length.values()))
+    t = float(look.begin[best] + look.end[best]) / 2
+    mode = np.asarray(course.mode[best])
+    x = state_at(curve, look.parameter, look.begin[best], t, look.x[best], mode, course.part[best])
+    return t, np.asarray(x), mode
+
+
+def tests(curve: OrbitCurve, spot: Spot, scale: float) -> dict[Test, float]:
+    """Functions of the points of a branch; those of `CORNERS` are positive as long as the orbit is one."""
+    look, course = spot.look, spot.course
+    out = {Test("low"): float(look.u[-1]), Test("high"): 1 - float(look.u[-1])}
+    ends, slots = np.asarray(course.ends), np.asarray(look.least)
+    length = (np.asarray(look.end) - np.asarray(look.begin)) / float(curve.time)
+    rates, margins, n = np.asarray(look.rates), np.asarray(look.margins), int(course.num)
+    for i in range(n):
+        if ends[i] == EVENT:
+            if ends[(i + 1) % n] != FREE:
+                out[Test("rate", i)] = -float(rates[i])
+            if np.isfinite(margins[i]):
+                out[Test("margin", i)] = float(margins[i])
+        if n > 1 and ends[i] != LEAST and ends[i - 1] != LEAST:
+            out[Test("duration", i)] = float(length[i])
+        for j, value in enumerate(slots[i]):
+            if np.isfinite(value):
+                out[Test("guard", i, j)] = float(value)
+    out[Test("fold")] = float(look.tangent[-1])
+    sign, log = np.asarray(look.branch)
+    out[Test("branch")] = float(sign * np.exp(np.clip(log - scale, -300, 300)))
+    rho = spot.trivial(curve.autonomous)
+    finite = rho[np.isfinite(rho)]
+    out[Test("flip")] = float(np.prod((1 + finite) / (1 + np.abs(finite))).real)
+    pairs = [finite[i] * finite[j] - 1 for i in range(len(finite)) for j in range(i)]
+    out[Test("Neimark-Sacker")] = float(np.prod([p / (1 + abs(p)) for p in pairs]).real) if pairs else 1.0
+    return out
+
+
+class Zero(NamedTuple):
+    """The zero of a test function: where, and what else vanishes there."""
+
+    s: float
+    test: Test
+    spot: Spot
+    others: tuple[Test, ...]
+
+
+@dataclasses.dataclass
+class Arc:
+    """Points one after the other, up to one at which the course ends, and the bifurcations passed on the way."""
+
+    spots: list[Spot]
+    passed: list[tuple[int, Zero]] = dataclasses.field(default_factory=list)
+    end: Zero | None = None
+    why: str = ""
+    closed: bool = False
+
+
+@dataclasses.dataclass
+class OrbitTracer:
+    """Traces arcs."""
+
+    curve: OrbitCurve
+    max_step: float
+    max_points: int
+
+    def at(self, spot: Spot, s: float, guess: Any = None) -> Spot | None:
+        """The point at the distance `s` along the tangent of another."""
+        look = spot.look
+        guess = look.u + s * look.tangent if guess is None else guess
+        found = advance(
+            self.curve, spot.course, look.u, look.tangent, np.asarray(s, np.float64), guess, np.asarray(True)
+        )
+        return spot_of(self.curve, found, spot.course) if bool(found.good) else None
+
+    def between(self, a: Spot, b: Spot, value: float) -> Spot | None:
+        """The point between two others at which the parameter has this value."""
+        length = float(a.look.tangent @ (b.look.u - a.look.u))
+        seen = {0.0: a, length: b}
+
+        def off(s: float) -> float:
+            if s not in seen:
+                here = self.at(a, s, a.look.u + s / length * (b.look.u - a.look.u))
+                if here is None:
+                    raise ArithmeticError
+                seen[s] = here
+            return seen[s].parameter - value
+
+        try:
+            s = float(toms748(off, *sorted((0.0, length)), xtol=1e-15, rtol=1e-14, maxiter=60))
+            off(s)
+        except (ArithmeticError, ValueError):
+            return None
+        return seen[s]
+
+    def corrected(self, course: Course, guess: Any, border: Any = None) -> Spot | None:
+        """The orbit in a course next to a guess, at the same parameter (or on another plane)."""
+        border = np.eye(len(guess))[-1] if border is None else border
+        found = advance(self.curve, course, guess, border, np.zeros(()), guess, np.asarray(True))
+        return spot_of(self.curve, found, course) if bool(found.good) else None
+
+    def arc(self, out: Arc, begin: Spot | None = None) -> Iterator[Spot]:
+        """Follows the branch along the tangent at the last point of `out`, to which it adds, point by point. `begin`: a
+        point at which it has been all round."""
+        length, spot, steps = FIRST, out.spots[-1], 0
+        while len(out.spots) < self.max_points:
+            step = self.at(spot, length)
+            turn = np.inf
+            if step is not None:
+                turn = float(np.arccos(np.clip(float(spot.look.tangent @ step.look.tangent), -1, 1)))
+            zeros = self.zeros(spot, step, length) if step is not None and turn <= 0.5 else None
+            if step is None or zeros is None:
+                length /= 2
+                if length < SHORTEST:
+                    out.why = f"the last orbit that could be found, at {spot.parameter:.10g}"
+                    return
+                continue
+            for zero in zeros:
+                if zero.test.kind == "Neimark-Sacker" and not _complex_pair(zero.spot):
+                    continue
+                out.spots.append(zero.spot)
+                if zero.test.kind not in PASSED:
+                    out.end = zero
+                    yield zero.spot
+                    return
+                out.passed.append((len(out.spots) - 1, zero))
+                yield zero.spot
+            steps += 1
+            if begin is not None and steps > 3 and self.passes(begin, spot, step):
+                out.spots.append(begin)
+                out.closed = True
+                return
+            spot = step
+            out.spots.append(spot)
+            yield spot
+            speed = float(np.max(np.abs(spot.look.tangent) / np.maximum(1, np.abs(spot.look.u))))
+            length = min(self.max_step / speed, length * float(np.clip(TURN / max(turn, 1e-9), 0.5, 2)))
+        out.why = f"max_points = {self.max_points}, at {spot.parameter:.10g}"
+
+    def passes(self, begin: Spot, spot: Spot, step: Spot) -> bool:
+        """Whether another orbit lies on the curve between two points."""
+        value, upwards = begin.parameter, step.parameter > spot.parameter
+        if not min(spot.parameter, step.parameter) <= value < max(spot.parameter, step.parameter):
+            return False
+        if begin.course.key() != spot.course.key() or (begin.look.tangent[-1] > 0) != upwards:
+            return False
+        here = self.between(spot, step, value)
+        return here is not None and alike(here, begin, self.curve, SAME)
+
+    def zeros(self, spot: Spot, step: Spot, length: float) -> list[Zero] | None:
+        """The zeros of test functions between two points, in their order, up to the first at which the course ends;
+        None if the step must be shorter for them to be told."""
+        scale = float(spot.look.branch[1])
+        before, after = (tests(self.curve, p, scale) for p in (spot, step))
+        changed = []
+        for test, value in before.items():
+            if test not in after or after[test] == 0 or value * after[test] > 0:
+                continue
+            if test.kind in (*CORNERS, "low", "high") and after[test] > 0:
+                continue  # it comes from where it could not be: a start on the point itself
+            changed.append(test)
+        found, lost = [], []
+        for test in changed:
+            zero = self.located(spot, step, length, test, scale)
+            found += [] if zero is None else [zero]
+            lost += [test] if zero is None else []
+        for test in lost:
+            # Beside a singular point, which another test function may know.
+            at = next((z for z in found if abs(tests(self.curve, z.spot, scale).get(test, np.inf)) < VANISHES), None)
+            if at is None and test.kind != "branch":
+                return None
+            found += [] if at is None else [at._replace(test=test)]
+        found.sort(key=lambda zero: zero.s)
+        out: list[Zero] = []
+        for zero in found:
+            final = zero.test.kind not in PASSED
+            if final:
+                together = [z for z in found if abs(z.s - zero.s) < NEAR * length + 1e-9 and z is not zero]
+                out.append(self.told(zero, together))
+                break
+            out.append(zero)
+        if out and out[-1].test.kind in (*CORNERS, "branch"):
+            # A test function may pass its zero together with the corner's; it is the corner's then.
+            # (What crosses at a branch point may turn round there, and the point is known less exactly.)
+            near = 100 * NEAR if out[-1].test.kind == "branch" else NEAR
+            out = [z for z in out[:-1] if out[-1].s - z.s > near * length + 1e-9] + out[-1:]
+        return out
+
+    def told(self, zero: Zero, together: list[Zero]) -> Zero:
+        """What vanishes at one point, by the first of `CORNERS`."""
+        rank = {kind: i for i, kind in enumerate((*CORNERS, "branch", "low", "high"))}
+        several = sorted([zero, *together], key=lambda z: rank.get(z.test.kind, 99))
+        first = several[0]
+        others = tuple(dict.fromkeys(z.test for z in several[1:]))
+        return first._replace(others=others)
+
+    def value(self, spot: Spot, test: Test, scale: float) -> float:
+        found = tests(self.curve, spot, scale).get(test)
+        if found is None:
+            raise ArithmeticError(f"{test} is not a number")
+        return found
+
+    def located(self, spot: Spot, step: Spot, length: float, test: Test, scale: float) -> Zero | None:
+        """By bracketing: the curve is smooth there, and so is the test function but for the least value of a guard."""
+        seen: dict[float, Spot] = {0.0: spot, length: step}
+        chord = step.look.u - spot.look.u
+
+        def value(s: float) -> float:
+            if s not in seen:
+                here = self.at(spot, s, spot.look.u + s / length * chord)
+                if here is None:
+                    raise ArithmeticError
+                seen[s] = here
+            return self.value(seen[s], test, scale)
+
+        rough, singular = test.kind == "guard", False
+        try:
+            s = toms748(value, 0.0, length, xtol=1e-5 * length if rough else 1e-14, rtol=1e-14, maxiter=60)
+            s = float(s)
+            value(s)
+        except ArithmeticError:
+            singular = True
+        if singular or test.kind == "branch":
+            # Beside its zero the equations are singular: the last that could be solved tells about where.
+            s = min((s for s in seen if s > 0), key=lambda s: abs(tests(self.curve, seen[s], scale).get(test, np.inf)))
+            found = self.interpolated(spot, s, length, chord, scale, test)
+            return None if found is None else Zero(found[0], test, found[1], ())
+        return Zero(s, test, seen[s], ())
+
+    def interpolated(
+        self, spot: Spot, s: float, length: float, chord: Any, scale: float, test: Test
+    ) -> tuple[float, Spot] | None:
+        """A point at which the equations are singular, by polynomials through points beside it."""
+        nodes, spots = [], []
+        for share in (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0):
+            node = s + 0.5 * length * share
+            here = self.at(spot, node, spot.look.u + node / length * chord)
+            if here is not None and test in tests(self.curve, here, scale):
+                nodes.append(share)
+                spots.append(here)
+        if len(nodes) < 4:
+            return None
+        powers = np.vander(nodes, increasing=True)
+        values = [self.value(here, test, scale) for here in spots]
+        roots = np.polynomial.Polynomial(np.linalg.solve(powers, values)).roots()
+        real = [r.real for r in roots if abs(r.imag) < 1e-6 and abs(r) < 1]
+        if not real:
+            return None
+        root = min(real, key=abs)
+        weights = np.linalg.solve(powers.T, root ** np.arange(len(nodes)))
+        u = weights @ np.stack([here.look.u for here in spots])
+        found = advance(self.curve, spot.course, u, spot.look.tangent, np.zeros(()), u, np.asarray(False))
+        return s + 0.5 * length * root, spot_of(self.curve, found, spot.course)
+
+
+def alike(a: Spot, b: Spot, curve: OrbitCurve, tolerance: float) -> bool:
+    """Whether two orbits of one parameter are the same, or one of them the other several times."""
+    sizes = np.asarray(curve.sizes)
+    pairs = ((a.look.mean, b.look.mean, sizes), (a.look.square, b.look.square, sizes**2))
+    return all(float(np.max(np.abs(x - y) / size)) < tolerance for x, y, size in pairs)
+
+
+def turned(spot: Spot) -> Spot:
+    look = spot.look
+    branch = look.branch * np.array([-1, 1])  # the sign of a determinant of which the tangent is a row
+    return dataclasses.replace(spot, look=look._replace(tangent=-look.tangent, branch=branch))
+
+
+def _complex_pair(spot: Spot) -> bool:
+    on = np.abs(np.abs(spot.multipliers) - 1) < 1e-5
+    return bool(np.any(on & (np.abs(np.imag(spot.multipliers)) > 1e-6)))

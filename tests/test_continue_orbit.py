@@ -1,0 +1,232 @@
+"""Branches of periodic orbits through the bifurcations of chapter 6, against 40-digit references."""
+
+import branch_reference
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import Motion, pid
+
+import nsjax
+from nsjax import continue_orbit, find_orbit, gallery
+
+
+POINTS = branch_reference.POINTS
+
+
+def orbit_of(system, y0, **options):
+    method = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-12), max_steps=8192, max_events=16)
+    return find_orbit(system, y0, **(method | options))
+
+
+@pytest.fixture(scope="module")
+def stick_slip():
+    """Section 6.7."""
+    system = gallery.StickSlip(c=0.1, v_dr=0.5)
+    return continue_orbit(system, orbit_of(system, Motion(2.0, 0.0), period=8.0), "v_dr", (0.1, 1.3))
+
+
+@pytest.fixture(scope="module")
+def friction():
+    """Section 6.8, from its right end."""
+    system = gallery.ForcedFriction(omega=0.8)
+    return continue_orbit(system, orbit_of(system, Motion(5.4, 2.7)), "omega", (0.5, 0.85))
+
+
+@pytest.fixture(scope="module")
+def belt():
+    """Section 6.9, from the stable branch I."""
+    system = gallery.ForcedStickSlip(omega=1.65)
+    return continue_orbit(system, orbit_of(system, Motion(1.73, -0.83), order=2), "omega", (1.5, 1.95))
+
+
+@pytest.fixture(scope="module")
+def trilinear():
+    """Section 6.6, from the orbit without contact."""
+    system = gallery.Trilinear(omega=1.15)
+    return continue_orbit(system, orbit_of(system, Motion(-0.1, -0.7)), "omega", (0.5, 2.0))
+
+
+def the(branch, value):
+    """The special point there."""
+    found = [b for b in branch.special_points if abs(b.value - value) < 1e-8]
+    assert found, f"none at {value} among {[b.value for b in branch.special_points]}"
+    return found[0]
+
+
+def same_multipliers(found, want, tolerance=1e-6):
+    """Both sides, in either order, and pairs in either order."""
+
+    def listed(side):
+        return sorted(np.round(np.asarray(side, complex), 12), key=lambda z: (-abs(z), z.imag))
+
+    def close(a, b):
+        pairs = list(zip(listed(a), listed(b)))
+        return all(abs(x - y) < tolerance if np.isfinite(y) else np.isinf(x) for x, y in pairs)
+
+    first, second = want
+    a, b = found
+    assert (close(a, first) and close(b, second)) or (close(a, second) and close(b, first)), (found, want)
+
+
+def sides(name, *which):
+    return tuple(POINTS[name].multipliers[side] for side in which)
+
+
+def stability_agrees(branch, system, number, seed, laps=40, **where):
+    """Orbits at random points of the branches, perturbed, return or leave."""
+    generator = np.random.default_rng(seed)
+    tried = 0
+    for part in branch.branches:
+        rho = np.sort(np.abs(np.asarray(part.multipliers)), axis=1)[:, -1]
+        for i in generator.permutation(len(part))[:number]:
+            if not np.isfinite(rho[i]) or 0.8 < rho[i] < 1.2:
+                continue  # too slow to tell, or never to be met forwards
+            here = system(omega=float(part.values[i]), **where)
+            y0 = jax.tree.map(lambda leaf, i=i: jnp.asarray(leaf[i]), part.ys)
+            t0, period = float(part.ts[i]), float(part.periods[i])
+            moved = jax.tree.map(lambda leaf: leaf + 1e-5, y0)
+            end = nsjax.solve(
+                here, t0, t0 + laps * period, moved, solver=dfx.Tsit5(), stepsize_controller=pid(1e-11),
+                max_steps=100_000, max_events=1000, throw=False,
+            )  # fmt: skip
+            away = max(abs(float(a) - float(b)) for a, b in zip(end.y1, y0))
+            assert (away < 1e-4) == bool(part.stable[i]), (part.values[i], rho[i], away)
+            tried += 1
+    return tried
+
+
+def test_infinitely_unstable_fold(stick_slip):
+    """Section 6.7, pitfall 24: the stable and the infinitely unstable branch, both, from one start."""
+    point, want = the(stick_slip, POINTS["6.7 fold"].at), POINTS["6.7 fold"]
+    assert point.kind == "infinitely unstable fold" and point.discontinuous and point.count == ((1, 1), ())
+    np.testing.assert_allclose(point.value, want.at, atol=1e-11)
+    np.testing.assert_allclose(point.period, want.period, atol=1e-10)
+    same_multipliers(point.multipliers, sides("6.7 fold", "stable", "unstable"))
+    assert len(stick_slip.branches) == 1 and list(stick_slip.values[[0, -1]]) == pytest.approx([0.1, 0.1])
+    (at,) = stick_slip.indices
+    assert stick_slip.stable[:at].all() and not stick_slip.stable[at + 1 :].any()
+    assert np.isinf(stick_slip.multipliers[at + 2 :, 0]).all()
+    np.testing.assert_allclose(np.max(stick_slip.high.x), want.amplitude, atol=0.2)
+    assert "infinitely unstable fold" in str(stick_slip)
+
+
+def test_infinitely_unstable_orbits(stick_slip):
+    """The amplitude of the unstable orbit at v_dr = 0.5, found backwards by shooting."""
+    system = gallery.StickSlip(c=0.1, v_dr=0.5)
+    unstable = np.flatnonzero(~stick_slip.stable)
+    i = unstable[np.argmin(np.abs(stick_slip.values[unstable] - 0.5))]
+    system = gallery.StickSlip(c=0.1, v_dr=float(stick_slip.values[i]))
+    y0 = jax.tree.map(lambda leaf: jnp.asarray(leaf[i]), stick_slip.ys)
+    orbit = orbit_of(system, y0, period=float(stick_slip.periods[i]), backward=True)
+    top = orbit.maximum(lambda t, y: y.x)
+    np.testing.assert_allclose(stick_slip.high.x[i], top, atol=1e-4)
+    np.testing.assert_allclose(stick_slip.periods[i], orbit.period, atol=1e-8)
+
+
+def test_symmetry_breaking(friction):
+    """Section 6.8: A smooth, B discontinuous, C a sliding-mode transition that is no bifurcation."""
+    a, b, c = (the(friction, POINTS[f"6.8 {name}"].at) for name in "ABC")
+    assert (a.kind, a.discontinuous, a.criticality) == ("symmetry breaking", False, "supercritical")
+    assert (b.kind, b.discontinuous, b.criticality) == ("symmetry breaking", True, "supercritical")
+    assert (c.kind, c.discontinuous, c.transition) == ("none", True, "sliding")
+    assert a.evidence == b.evidence == c.evidence == "both"
+    assert (b.count, c.count) == (((1, 1, 1), (1,)), ((1,), (1,)))
+    for point, name in ((a, "A"), (b, "B"), (c, "C")):
+        np.testing.assert_allclose(point.value, POINTS[f"6.8 {name}"].at, atol=1e-10)
+    same_multipliers(b.multipliers, sides("6.8 B", *POINTS["6.8 B"].multipliers)[:2])
+    same_multipliers(c.multipliers, sides("6.8 C", *POINTS["6.8 C"].multipliers))
+    (crossing,) = b.crossings
+    np.testing.assert_allclose(crossing.q, POINTS["6.8 B"].more["q_613"], atol=1e-6)
+    assert crossing.kind == "+1" and c.crossings == []
+    # Branch I, and branch II with its mirror image: C is passed twice.
+    assert len(friction.branches) == 2
+    assert sum(abs(s.value - c.value) < 1e-8 for s in friction.others[0].special) == 2
+
+
+@pytest.mark.slow
+def test_stability_by_simulation(friction, belt):
+    assert stability_agrees(friction, gallery.ForcedFriction, 8, seed=1) > 5
+    assert stability_agrees(belt, gallery.ForcedStickSlip, 8, seed=2) > 5
+
+
+def test_forced_stick_slip(belt):
+    """Section 6.9: A, B, C, both smooth folds, the flip, the Neimark-Sacker point, and branches I to VIII."""
+    kinds = {
+        "A": ("fold", True), "B": ("fold-flip", True), "C": ("flip", True), "fold I/V": ("fold", False),
+        "fold II/III": ("fold", False), "flip III/IV": ("flip", False), "Neimark-Sacker III": ("Neimark-Sacker", False),
+    }  # fmt: skip
+    for name, (kind, corner) in kinds.items():
+        want = POINTS[f"6.9 {name}"]
+        point = the(belt, want.at)
+        assert (point.kind, point.discontinuous) == (kind, corner), name
+        np.testing.assert_allclose(point.value, want.at, atol=1e-10, err_msg=name)
+        np.testing.assert_allclose(point.period, want.period, rtol=1e-10, err_msg=name)
+        values = list(want.multipliers.values())
+        same_multipliers(point.multipliers, (values[0], values[-1]))
+    b, c = the(belt, POINTS["6.9 B"].at), the(belt, POINTS["6.9 C"].at)
+    assert b.count == ((), (1, 1, 2, 4)) and b.evidence == "both"
+    assert [crossing.kind for crossing in b.crossings] in (["-1", "+1"], ["+1", "-1"])
+    assert c.count in (((1, 2), (1,)), ((1,), (1, 2)))
+    # I to V are one closed curve; VI and VII one of period 4, from B to the flip; VIII has period 8.
+    closed, *others = belt.branches
+    assert "closed" in closed.ends[1] and len(closed.bifurcations if closed.others == () else closed.special) >= 6
+    assert sorted(int(o.orders[0]) for o in others) == [4, 8]
+
+
+def test_another_start(belt):
+    """From the unstable branch IV, and from the other end, the same comes out."""
+    system = gallery.ForcedStickSlip(omega=1.68)
+    orbit = orbit_of(system, Motion(2.11, -0.47), order=2)
+    branch = continue_orbit(system, orbit, "omega", (1.5, 1.95))
+    want, found = (sorted((b.kind, round(b.value, 9)) for b in x.bifurcations) for x in (belt, branch))
+    assert want == found
+
+
+@pytest.mark.slow
+def test_trilinear(trilinear):
+    """Section 6.6: no bifurcation at A, a discontinuous fold at B, and the smooth fold beyond."""
+    a, b, fold = (the(trilinear, POINTS[f"6.6 {name}"].at) for name in ("A", "B", "fold"))
+    assert (a.kind, b.kind, fold.kind) == ("none", "fold", "fold")
+    assert (a.discontinuous, b.discontinuous, fold.discontinuous) == (True, True, False)
+    assert a.transition is None and a.evidence == b.evidence == "both" and a.crossings == []
+    for point, name in ((a, "A"), (b, "B"), (fold, "fold")):
+        np.testing.assert_allclose(point.value, POINTS[f"6.6 {name}"].at, atol=1e-10)
+    same_multipliers(a.multipliers, sides("6.6 A", "free", "contact"))
+    same_multipliers(b.multipliers, sides("6.6 B", "free", "contact"))
+    np.testing.assert_allclose([c.q for c in b.crossings], [POINTS["6.6 B"].more["q_613"]], atol=1e-6)
+    assert len(trilinear.branches) == 1 and list(trilinear.values[[0, -1]]) == pytest.approx([0.5, 2.0])
+
+
+def test_growing():
+    """A branch can be looked at while it grows, left, and gone on with."""
+    system = gallery.StickSlip(c=0.1, v_dr=0.5)
+    orbit = orbit_of(system, Motion(2.0, 0.0), period=8.0)
+    growth = nsjax.OrbitGrowth(system, orbit, "v_dr", (0.45, 0.6))
+    for point in growth:
+        if point.parameter > 0.52:
+            break
+    part = growth.branch
+    assert 0.52 < part.values.max() < 0.6
+    for _ in growth:
+        pass
+    whole, at_once = growth.branch, continue_orbit(system, orbit, "v_dr", (0.45, 0.6))
+    np.testing.assert_allclose(whole.values, at_once.values, atol=1e-12)
+    assert whole.ends == at_once.ends == ("v_dr = 0.45", "v_dr = 0.6")
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(parameter="speed"), "must be one of"),
+        (dict(interval=(0.6, 0.7)), "must be \\(low, high\\) and hold 0.5"),
+        (dict(scale=Motion(1.0, 0.0)), "must hold a positive number"),
+    ],
+)
+def test_mistakes(change, message):
+    system = gallery.StickSlip(c=0.1, v_dr=0.5)
+    orbit = orbit_of(system, Motion(2.0, 0.0), period=8.0)
+    given = dict(parameter="v_dr", interval=(0.4, 0.6)) | change
+    with pytest.raises(ValueError, match=message):
+        continue_orbit(system, orbit, **given)
