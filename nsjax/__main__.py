@@ -1,4 +1,4 @@
-"""The command line: `python -m nsjax list`, `run 3.4`, `orbit model.py:Oscillator`."""
+"""The command line: `python -m nsjax list`, `run 3.4`, `orbit model.py:Oscillator`, `continue 6.6`."""
 
 import argparse
 import json
@@ -11,9 +11,28 @@ import diffrax as dfx
 import jax
 
 from . import gallery
-from ._cli import draw, Job, load, options, orbit_record, record, report, simulation_record, UsageError
+from ._cli import (
+    branch_record,
+    Diagram,
+    diagram_for,
+    DIAGRAMS,
+    draw,
+    draw_branches,
+    Job,
+    load,
+    numbers,
+    options,
+    orbit_record,
+    record,
+    report,
+    simulation_record,
+    UsageError,
+)
+from ._continue_orbit import continue_orbit
 from ._find_orbit import find_orbit
 from ._orbit import Orbit
+from ._orbit_branch import OrbitBranch
+from ._parameter import get_parameter, parameter_path
 from ._solution import is_okay, RESULTS, Solution
 from ._solve import solve
 
@@ -29,11 +48,12 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="nsjax", description="Piecewise-smooth dynamics: the systems of Leine (2000), and your own.")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="{list,run,orbit}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="{list,run,orbit,continue}")
     commands.add_parser("list", help="list the systems of the gallery")
     run = commands.add_parser("run", help="simulate a system, find its periodic orbit, write tables and pictures")
     orbit = commands.add_parser("orbit", help="find a periodic orbit")
-    for command in (run, orbit):
+    follow = commands.add_parser("continue", help="follow a periodic orbit while a parameter varies, with pictures")
+    for command in (run, orbit, follow):
         add = command.add_argument
         add("system", metavar="S", help="a key of `list`, such as 3.4, or a class of yours: path/model.py:ClassName")
         add("--set", action="append", default=[], metavar="name=value", help="parameters, with commas or repeated")
@@ -49,10 +69,21 @@ def _parser() -> argparse.ArgumentParser:
         )
     run.add_argument("--y0", metavar="x=..,v=..", help="where the simulation starts; names of the state, or numbers")
     run.add_argument("--t1", type=float, help="end time (default: that of the gallery, 20 periods, or 100)")
-    run.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out"), help="folder for pictures (default: out)")
-    orbit.add_argument(
-        "--y0", metavar="x=..,v=..", help="guess of a state on the orbit; names of the state, or numbers"
+    run.add_argument(
+        "--branches",
+        action="store_true",
+        help=f"draw the diagrams of the thesis too, of {', '.join(DIAGRAMS)}: minutes",
     )
+    for command in (orbit, follow):
+        command.add_argument(
+            "--y0", metavar="x=..,v=..", help="guess of a state on the orbit; names of the state, or numbers"
+        )
+    follow.add_argument("--param", metavar="NAME", help="the parameter that varies")
+    follow.add_argument("--range", metavar="LO,HI", help="of the parameter; the orbit is sought at its value in --set")
+    for command in (run, follow):
+        command.add_argument(
+            "--out", type=pathlib.Path, default=pathlib.Path("out"), help="folder for pictures (default: out)"
+        )
     return parser
 
 
@@ -60,7 +91,7 @@ def _joined(argv: list[str]) -> list[str]:
     """`--y0 -1,0` as `--y0=-1,0`, which argparse would take for an option."""
     found: list[str] = []
     for word in argv:
-        if found and found[-1] in ("--y0", "--t0", "--t1") and word.startswith("-"):
+        if found and found[-1] in ("--y0", "--t0", "--t1", "--range") and word.startswith("-"):
             found[-1] += f"={word}"
         else:
             found.append(word)
@@ -142,8 +173,31 @@ def _list() -> int:
     return 0
 
 
+def _diagram(job: Job, parameter: str | None, interval: str | None) -> Diagram:
+    """What is to be continued; an orbit is sought only if it makes sense."""
+    ends = None if interval is None else numbers(interval, "An end of --range")
+    if ends is not None and (len(ends) != 2 or not ends[0] < ends[1]):
+        raise UsageError(f"--range must be two numbers, the lower one first, but got {interval!r}.")
+    diagram = diagram_for(job, parameter, None if ends is None else (ends[0], ends[1]))
+    value = float(get_parameter(job.system, parameter_path(job.system, diagram.parameter)))
+    low, high = diagram.interval
+    if not low <= value <= high:
+        raise UsageError(
+            f"{diagram.parameter} = {value:g} lies outside [{low:g}, {high:g}]; give another --range, or a value where "
+            f"there is an orbit: --set {diagram.parameter}=.."
+        )
+    return diagram
+
+
+def _branches(args: argparse.Namespace, job: Job, orbit: Orbit, diagram: Diagram) -> OrbitBranch:
+    return continue_orbit(job.system, orbit, diagram.parameter, diagram.interval, **_controller(args.tol))
+
+
 def _run(args: argparse.Namespace) -> int:
     job = load(args.system, options(args.set, "--set"), args.y0)
+    if args.branches and job.name not in DIAGRAMS:
+        raise UsageError(f"--branches is for {', '.join(DIAGRAMS)}; for others there is `nsjax continue`.")
+    diagram = _diagram(job, None, None) if args.branches else None
     t0 = job.t0 if args.t0 is None else args.t0
     sol = _simulate(args, job, t0)
     orbit, trouble = None, None
@@ -152,24 +206,49 @@ def _run(args: argparse.Namespace) -> int:
     elif is_okay(sol.result) and (args.period is not None or not job.from_gallery):
         orbit, trouble = _find(args, job, job.y0, t0, _mode(args, job))
     files = draw(job, sol, orbit, args.out)
+    words = [report(job, sol, orbit, trouble)]
+    found = {"simulation": simulation_record(sol), "orbit": None if orbit is None else orbit_record(orbit)}
+    if diagram is not None and orbit is not None:
+        branch = _branches(args, job, orbit, diagram)
+        files += draw_branches(job, branch, diagram, args.out)
+        words += ["", str(branch)]
+        found["continuation"] = branch_record(branch)
     out = sys.stderr if args.json == "-" else sys.stdout
-    print(report(job, sol, orbit, trouble), *("", *map(str, files)), sep="\n", file=out)
-    numbers = {"simulation": simulation_record(sol), "orbit": None if orbit is None else orbit_record(orbit)}
-    _write_json(args.json, record(job, **numbers))
+    print(*words, "", *files, sep="\n", file=out)
+    _write_json(args.json, record(job, **found))
     return 0 if is_okay(sol.result) or sol.result == RESULTS.accumulation_reached else FAILURE
+
+
+def _guess(args: argparse.Namespace, job: Job) -> Any:
+    return job.guess.y0 if job.guess is not None and args.y0 is None else _start(job)
 
 
 def _orbit(args: argparse.Namespace) -> int:
     job = load(args.system, options(args.set, "--set"), args.y0)
     t0 = job.t0 if args.t0 is None else args.t0
-    guess = job.guess.y0 if job.guess is not None and args.y0 is None else _start(job)
-    orbit, trouble = _find(args, job, guess, t0, _mode(args, job))
+    orbit, trouble = _find(args, job, _guess(args, job), t0, _mode(args, job))
     if orbit is None:
         print(f"nsjax: no periodic orbit: {trouble}", file=sys.stderr)
         return FAILURE
     if args.json != "-":
         print(report(job, None, orbit, None))
     _write_json(args.json, record(job, orbit=orbit_record(orbit)))
+    return 0
+
+
+def _continue(args: argparse.Namespace) -> int:
+    job = load(args.system, options(args.set, "--set"), args.y0)
+    diagram = _diagram(job, args.param, args.range)
+    t0 = job.t0 if args.t0 is None else args.t0
+    orbit, trouble = _find(args, job, _guess(args, job), t0, _mode(args, job))
+    if orbit is None:
+        print(f"nsjax: no periodic orbit: {trouble}", file=sys.stderr)
+        return FAILURE
+    branch = _branches(args, job, orbit, diagram)
+    files = draw_branches(job, branch, diagram, args.out)
+    out = sys.stderr if args.json == "-" else sys.stdout
+    print(report(job, None, None, None), "", branch, "", *files, sep="\n", file=out)
+    _write_json(args.json, record(job, **branch_record(branch)))
     return 0
 
 
@@ -188,7 +267,8 @@ def main(argv: list[str] | None = None) -> int:
     jax.config.update("jax_enable_x64", True)
     args = _parser().parse_args(_joined(sys.argv[1:] if argv is None else argv))
     try:
-        return {"list": lambda _: _list(), "run": _run, "orbit": _orbit}[args.command](args)
+        commands = {"list": lambda _: _list(), "run": _run, "orbit": _orbit, "continue": _continue}
+        return commands[args.command](args)
     except (UsageError, OSError) as error:
         message = str(error)
     except (TypeError, ValueError) as error:  # a mistake in the model or in an argument

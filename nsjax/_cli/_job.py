@@ -51,8 +51,13 @@ def _number(text: str, what: str) -> float:
 
 def _value(text: str, what: str) -> Value:
     """A number, or numbers separated by commas."""
-    values = [_number(part, what) for part in text.split(",")]
+    values = numbers(text, what)
     return values if len(values) > 1 else values[0]
+
+
+def numbers(text: str, what: str) -> list[float]:
+    """Numbers separated by commas."""
+    return [_number(part, what) for part in text.split(",")]
 
 
 def options(texts: list[str], flag: str) -> dict[str, str]:
@@ -195,7 +200,7 @@ def _state_class(module: ModuleType, system: System) -> Any:
 def _state(text: str, cls: Any, defaults: Mapping[str, Any]) -> Any:
     """A state from its words: of class `cls`; if that is `None`, a dictionary of named components, or an array."""
     if "=" not in text:
-        values = [_number(part, "A component of --y0") for part in text.split(",")]
+        values = numbers(text, "A component of --y0")
         if cls is None:
             return jnp.asarray(values)
         if len(values) != len(cls._fields):

@@ -29,52 +29,57 @@ def draw(job: Job, sol: Solution, orbit: Orbit | None, out: pathlib.Path) -> lis
         figures["phase-portrait"] = _phase_portrait(sol, orbit, labels)
     if orbit is not None:
         figures["fundamental-matrix"] = _fundamental_matrix(orbit, names, labels)
-        figures["multipliers"] = _figure(4.5, 4.5)
+        figures["multipliers"] = figure(4.5, 4.5)
         plot.multipliers(orbit, ax=figures["multipliers"].add_subplot())
+    return save(job, figures, out)
+
+
+def save(job: Job, figures: dict[str, Any], out: pathlib.Path) -> list[pathlib.Path]:
+    """Writes figures by their kind, with the name of the job in their file names and titles."""
     out.mkdir(parents=True, exist_ok=True)
     stem = re.sub(r"[^\w.]+", "-", job.name.rpartition(":")[2] if not job.from_gallery else job.name).strip("-")
     files = []
     title = f"{job.name}: {job.title}" if job.from_gallery else stem
-    for kind, figure in figures.items():
-        figure.suptitle(textwrap.fill(title, int(11 * figure.get_figwidth())), fontsize="medium")
+    for kind, drawn in figures.items():
+        drawn.suptitle(textwrap.fill(title, int(11 * drawn.get_figwidth())), fontsize="medium")
         files.append(out / f"{stem}-{kind}.png")
-        figure.savefig(files[-1], dpi=150)
+        drawn.savefig(files[-1], dpi=150)
     return files
 
 
-def _figure(width: float, height: float) -> Any:
+def figure(width: float, height: float) -> Any:
     from matplotlib.figure import Figure  # not pyplot: no window, no state
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def _time_series(sol: Solution, names: list[str], labels: dict[Any, str]) -> Any:
-    figure = _figure(8, 1.2 + 2.0 * len(names))
-    axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    drawn = figure(8, 1.2 + 2.0 * len(names))
+    axes = drawn.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     for i, (name, ax) in enumerate(zip(names, axes)):
         plot.time_series(sol, name, ax=ax, labels=labels, legend=i == 0)
         ax.label_outer()
-    return figure
+    return drawn
 
 
 def _phase_portrait(sol: Solution, orbit: Orbit | None, labels: dict[Any, str]) -> Any:
-    figure = _figure(6.4, 5.2)
-    ax = figure.add_subplot()
+    drawn = figure(6.4, 5.2)
+    ax = drawn.add_subplot()
     if orbit is None:
         plot.phase_portrait(sol, ax=ax, labels=labels)
-        return figure
+        return drawn
     # The way to the orbit, in grey beneath it.
     plot.phase_portrait(
         sol, ax=ax, surfaces=False, events=False, legend=False, color="0.75", linewidth=0.8, label="simulation"
     )
     plot.phase_portrait(orbit, ax=ax, labels=labels)
-    return figure
+    return drawn
 
 
 def _fundamental_matrix(orbit: Orbit, names: list[str], labels: dict[Any, str]) -> Any:
     """Φ over one period; for an autonomous system from the maximum of the first component, as in Fig. 3.7."""
     n = len(names)
-    figure = _figure(1.2 + 2.6 * n, 1.0 + 1.9 * n)
+    drawn = figure(1.2 + 2.6 * n, 1.0 + 1.9 * n)
     t0, y0, mode = orbit.t0, orbit.y0, orbit.mode
     if orbit.system.period is None:
         sol = solved(orbit)
@@ -87,6 +92,6 @@ def _fundamental_matrix(orbit: Orbit, names: list[str], labels: dict[Any, str]) 
     nearby = 1e-9 * period  # both sides of each jump
     ts = np.sort(np.concatenate([np.linspace(0, period, 400), jumps - nearby, jumps + nearby]))
     phi = fundamental_matrix(orbit.system, t0, t0 + period, y0, ts=float(t0) + ts, mode=[int(m) for m in mode])
-    axes = figure.subplots(n, n, sharex=True, squeeze=False)
+    axes = drawn.subplots(n, n, sharex=True, squeeze=False)
     plot.fundamental_matrix(ts, phi, jumps, axes=axes, labels=labels)
-    return figure
+    return drawn

@@ -20,6 +20,9 @@ from ._units import Note, notes, ratio
 
 
 SHOWN = 24  # events of a simulation that are printed
+GREEK = tuple(
+    "alpha beta gamma delta epsilon zeta eta theta kappa lambda mu nu xi rho sigma tau phi chi psi omega".split()
+)
 
 
 class Units(NamedTuple):
@@ -43,14 +46,24 @@ class Units(NamedTuple):
         return cls(parameters, state, time)
 
     def labels(self) -> dict[Any, str]:
-        """For the axes of pictures: components, time, and entries of the fundamental matrix."""
-        named = {name: _with_unit(name, unit) for name, unit in [*self.state.items(), ("t", self.time)]}
+        """For the axes of pictures: parameters, components, time, and entries of the fundamental matrix."""
+        named = {name: _with_unit(_symbol(name), note.unit) for name, note in self.parameters.items()}
+        named |= {name: _with_unit(name, unit) for name, unit in [*self.state.items(), ("t", self.time)]}
         entries = {
             (i, j): _with_unit(f"$\\Phi_{{{i}{',' * (len(self.state) > 9)}{j}}}$", ratio(above, below))
             for i, above in enumerate(self.state.values(), 1)
             for j, below in enumerate(self.state.values(), 1)
         }
         return named | entries
+
+
+def _symbol(name: str) -> str:
+    """`alpha_0` as a formula, for pictures; a name that is no symbol as it is."""
+    base, _, below = name.partition("_")
+    if len(base) > 1 and base not in GREEK:
+        return name
+    letter = f"\\{base}" if len(base) > 1 else base
+    return f"${letter}_{{\\mathrm{{{below}}}}}$" if below else f"${letter}$"
 
 
 def _with_unit(name: str, unit: str) -> str:
@@ -173,7 +186,7 @@ def _parameters(system: System) -> dict[str, Any]:
     }
 
 
-def _named(y: Y) -> dict[str, Any]:
+def named(y: Y) -> dict[str, Any]:
     """The leaves of a state by name."""
     leaves = jax.tree_util.tree_flatten_with_path(y)[0]
     return {jax.tree_util.keystr(path, simple=True, separator=".") or "y": leaf for path, leaf in leaves}
@@ -194,8 +207,8 @@ def _events(system: System, events: Events) -> list[dict[str, Any]]:
             "switch": e.switch,
             "from": e.mode_before,
             "to": e.mode_after,
-            "y": _named(e.y_before),
-            "y_after": _named(e.y_after),
+            "y": named(e.y_before),
+            "y_after": named(e.y_after),
             "saltation": matrices[i],
             "transversality": e.transversality,
         }
@@ -208,7 +221,7 @@ def orbit_record(orbit: Orbit) -> dict[str, Any]:
     return {
         "period": orbit.period,
         "t0": orbit.t0,
-        "y0": _named(orbit.y0),
+        "y0": named(orbit.y0),
         "itinerary": list(orbit.itinerary),
         "events": _events(orbit.system, orbit.events),
         "monodromy": orbit.monodromy,
@@ -223,7 +236,7 @@ def simulation_record(sol: Solution) -> dict[str, Any]:
     return {
         "t0": sol.t0,
         "t1": sol.t1,
-        "y1": _named(sol.y1),
+        "y1": named(sol.y1),
         "mode1": dict(zip(sol.events.names, jnp.asarray(sol.mode1).tolist())),
         "events": _events(sol.system, sol.events),
         "result": "successful" if sol.result == RESULTS.successful else message(sol.result),

@@ -4,8 +4,14 @@ changes no global style. Matplotlib is imported by the first picture, not with n
 from ._branch import bifurcation_diagram as bifurcation_diagram
 from ._eigenvalues import eigenvalue_path as eigenvalue_path
 from ._matrix import fundamental_matrix as fundamental_matrix, multipliers as multipliers
+from ._orbit_branch import (
+    multiplier_circle as multiplier_circle,
+    multiplier_diagram as multiplier_diagram,
+    orbit_diagram as orbit_diagram,
+)
 from ._path import components as components
 from ._phase import phase_portrait as phase_portrait, poincare_section as poincare_section
+from ._poincare import brute_force as brute_force, poincare_map as poincare_map
 from ._time import time_series as time_series
 from ._tube import perturbation_tube as perturbation_tube
 from ._work_precision import work_precision as work_precision

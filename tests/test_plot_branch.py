@@ -1,0 +1,216 @@
+"""Diagrams of branches of periodic orbits: what is drawn of branches whose numbers are known."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import nsjax
+from nsjax import gallery, plot
+from nsjax._orbit_bifurcation import OrbitBifurcation
+from nsjax._orbit_branch import OrbitBranch
+
+
+LABELS = {"omega": "ω [rad/s]", "v_dr": "v [m/s]", "x": "x [m]", "v": "x' [m/s]"}
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+def special_at(kind, value, before, after=None, **changes):
+    """A corner from one pair of multipliers to another, or a smooth point."""
+    matrices = np.diag(before), np.diag(before if after is None else after)
+    finite = np.all(np.isfinite(matrices))
+    crossings = nsjax.eigenvalue_crossings(*matrices, multipliers=True) if after is not None and finite else []
+    sides = tuple(np.array(sorted(np.diag(m), key=lambda z: -abs(z)), complex) for m in matrices)
+    fields = dict(
+        kind=kind, discontinuous=after is not None, criticality=None, evidence="both", by_count=kind, by_crossing=None,
+        transition=None, parameter="omega", value=value, period=6.0, t=0.0, y=gallery.Motion(1.0, 0.0),
+        count=((1,), (1,)), surfaces=(), multipliers=sides, monodromies=matrices, crossings=crossings, halves=[],
+    )  # fmt: skip
+    return OrbitBifurcation(**fields | changes)
+
+
+def branch_of(system, parameter, values, heights, multipliers, special=(), indices=(), others=()):
+    values, heights = np.array(values, float), np.array(heights, float)
+    multipliers = np.array(multipliers, complex)
+    moduli = np.abs(multipliers)
+    n = len(values)
+    return OrbitBranch(
+        system=system, parameter=parameter, values=values, periods=np.full(n, 6.0), orders=np.ones(n, int),
+        ts=np.zeros(n), ys=gallery.Motion(0.5 * heights, np.zeros(n)), low=gallery.Motion(-heights, -2 * heights),
+        high=gallery.Motion(0.5 * heights, heights), mean=gallery.Motion(np.zeros(n), np.zeros(n)),
+        multipliers=multipliers, stable=np.all(moduli <= 1, axis=1), itineraries=("",) * n, special=tuple(special),
+        indices=tuple(indices), ends=("", ""), others=tuple(others),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def forced():
+    """A corner at 1.5 at which 0.8 jumps to 2, a second branch that begins there, and a flip at 1.9."""
+    system = gallery.ForcedFriction()
+    corner = special_at("symmetry breaking", 1.5, (0.8, 0.0), (2.0, 0.1))
+    flip = special_at("flip", 1.9, (-1.0, 0.25))
+    nothing = special_at("none", 1.3, (0.3, 0.0), (-0.5, 0.0))
+    other = branch_of(
+        system, "omega", [1.5, 1.3, 1.3, 1.2], [2.0, 1.9, 1.9, 1.5], [(0.4, 0), (0.3, 0), (-0.5, 0), (-0.6, 0)],
+        [corner, nothing], [0, 1],
+    )  # fmt: skip
+    return branch_of(
+        system, "omega", [1.0, 1.25, 1.5, 1.5, 1.75, 1.9, 2.0], [1.0, 1.5, 2.0, 2.0, 2.25, 2.5, 3.0],
+        [(0.5, 0), (0.6, 0), (0.8, 0), (2, 0.1), (1.5, -0.9), (-1.0, 0.25), (-0.9, 0.25)],
+        [corner, flip], [2, 5], [other],
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def belt():
+    """A fold at v_dr = 1 beyond which orbits are infinitely unstable."""
+    fold = special_at(
+        "infinitely unstable fold", 1.0, (1.0, 0.0), (np.inf, np.inf), parameter="v_dr",
+        multipliers=(np.array([1, 0], complex), np.array([np.inf, 1], complex)),
+        monodromies=(np.diag([1.0, 0.0]), np.full((2, 2), np.inf)),
+    )  # fmt: skip
+    inf = np.inf
+    return branch_of(
+        gallery.StickSlip(c=0.1), "v_dr", [0.2, 0.6, 1.0, 1.0, 0.6], [2.0, 2.1, 2.5, 2.5, 1.9],
+        [(1, 0), (1, 0), (1, 0), (inf, 1), (inf, 1)], [fold], [2],
+    )  # fmt: skip
+
+
+def points(line):
+    return np.column_stack(line.get_data())
+
+
+def lines(ax, label):
+    return [points(line) for line in ax.lines if line.get_label() == label]
+
+
+def texts(ax):
+    return sorted(text.get_text() for text in ax.texts)
+
+
+# The diagram.
+
+
+def test_stretches_end_where_stability_changes(forced):
+    ax = plot.orbit_diagram(forced, labels=LABELS)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("ω [rad/s]", "max |x| [m]")
+    stable = lines(ax, "stable periodic orbit")
+    assert [tuple(line[[0, -1], 0]) for line in stable] == [(1.0, 1.5), (1.9, 2.0), (1.5, 1.2)]
+    (unstable,) = lines(ax, "unstable periodic orbit")
+    np.testing.assert_allclose(unstable, [[1.5, 2.0], [1.75, 2.25], [1.9, 2.5]])
+    styles = {line.get_label(): line.get_linestyle() for line in ax.lines}
+    assert (styles["stable periodic orbit"], styles["unstable periodic orbit"]) == ("-", "--")
+    assert texts(ax) == ["discontinuous\nsymmetry breaking", "flip", "no bifurcation"]
+
+
+def test_marks_tell_what_a_point_is(forced):
+    ax = plot.orbit_diagram(forced, names=False)
+    marks = {points(line)[0, 0]: line for line in ax.lines if line.get_marker() == "o"}
+    assert {x: line.get_markerfacecolor() for x, line in marks.items()} == {1.5: "C3", 1.9: "C0", 1.3: "white"}
+    assert [points(marks[x])[0, 1] for x in (1.3, 1.5, 1.9)] == [1.9, 2.0, 2.5]
+    assert not texts(ax)
+
+
+def test_names_of_ones_own(forced):
+    ax = plot.orbit_diagram(forced, names=lambda special: {"flip": "A", "symmetry breaking": "B"}.get(special.kind, ""))
+    assert texts(ax) == ["A", "B"]
+
+
+@pytest.mark.parametrize(
+    "measure, label, first",
+    [
+        ("v", "max |x'| [m/s]", 2.0),
+        (lambda b: b.periods, "measure", 6.0),
+        (lambda b: b.high.x - b.low.x, "measure", 1.5),
+    ],
+)
+def test_measures(forced, measure, label, first):
+    ax = plot.orbit_diagram(forced, measure, labels=LABELS, legend=False)
+    assert ax.get_ylabel() == label and ax.get_legend() is None
+    assert points(ax.lines[0])[0, 1] == first
+
+
+def test_wrong_measures(forced):
+    with pytest.raises(ValueError, match="no component 'w'"):
+        plot.orbit_diagram(forced, "w")
+    with pytest.raises(ValueError, match="a number for each point"):
+        plot.orbit_diagram(forced, lambda b: 1.0)
+
+
+def test_infinitely_unstable_orbits_are_dotted(belt):
+    ax = plot.orbit_diagram(belt, labels=LABELS)
+    (dotted,) = lines(ax, "infinitely unstable periodic orbit")
+    np.testing.assert_allclose(dotted, [[1.0, 2.5], [0.6, 1.9]])
+    assert texts(ax) == ["discontinuous\ninfinitely unstable fold"]
+
+
+def test_an_axis_that_was_set_stays(forced):
+    ax = plt.figure().add_subplot()
+    ax.set(xlim=(1.4, 1.6), ylim=(1.9, 2.1))
+    plot.orbit_diagram(forced, ax=ax)
+    assert (ax.get_xlim(), ax.get_ylim()) == ((1.4, 1.6), (1.9, 2.1))
+
+
+# Multipliers.
+
+
+def test_multipliers_jump_along_their_path(forced):
+    ax = plot.multiplier_diagram(forced, part="real", labels=LABELS)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("ω [rad/s]", "Re λ [-]")
+    jumps = lines(ax, "jump of the multipliers")
+    at = {(jump[0, 0], *np.round(jump[[0, -1], 1], 12)) for jump in jumps}
+    assert at == {(1.5, 0.8, 2.0), (1.5, 0.0, 0.1), (1.3, 0.3, -0.5), (1.3, 0.0, 0.0)}
+    assert all(np.ptp(jump[:, 0]) == 0 for jump in jumps)
+    horizontal = {points(line)[0, 1] for line in ax.lines if points(line)[:, 0].tolist() == [0, 1]}
+    assert horizontal == {-1.0, 1.0}
+
+
+def test_multipliers_are_followed_not_sorted(forced):
+    """1.5, -0.9, then -1, 0.25: by modulus the first would go from 1.5 to -1."""
+    ax = plot.multiplier_diagram(forced, part="real")
+    ends = [tuple(line[-1]) for line in lines(ax, "unstable periodic orbit")]
+    assert ends == [(1.9, 0.25), (1.9, -1.0)]
+    ax = plot.multiplier_diagram(forced, part="real", which="largest")
+    assert [tuple(line[-1]) for line in lines(ax, "unstable periodic orbit")] == [(1.9, -1.0)]
+    assert len(lines(ax, "jump of the multipliers")) == 2
+
+
+def test_moduli(forced):
+    ax = plot.multiplier_diagram(forced, labels={"multiplier": "modulus"})
+    assert ax.get_ylabel() == "modulus"
+    assert min(points(line)[:, 1].min() for line in ax.lines) >= 0
+
+
+def test_infinite_multipliers_lie_on_the_edge(belt):
+    ax = plot.multiplier_diagram(belt)
+    top = ax.get_ylim()[1]
+    (dotted,) = lines(ax, "infinitely unstable periodic orbit")  # the multiplier 1 of the shift is left out
+    np.testing.assert_allclose(dotted[:, 1], top)
+    (stable,) = lines(ax, "stable periodic orbit")
+    np.testing.assert_allclose(stable[:, 1], 0)
+    (jump,) = lines(ax, "jump of the multipliers")
+    np.testing.assert_allclose(jump, [[1.0, 0.0], [1.0, top]])
+    assert "∞" in texts(ax)
+
+
+@pytest.mark.parametrize("words, named", [(dict(part="imag"), "part"), (dict(which="some"), "which")])
+def test_wrong_words(forced, words, named):
+    with pytest.raises(ValueError, match=f"`{named}` must be"):
+        plot.multiplier_diagram(forced, **words)
+
+
+def test_circle(forced, belt):
+    corner, flip = forced.special
+    ax = plot.multiplier_circle(corner)
+    (circle,) = (points(line) for line in ax.lines if len(points(line)) == 361)
+    np.testing.assert_allclose(np.hypot(*circle.T), 1)
+    (q,) = (c.q for c in corner.crossings)
+    assert q == pytest.approx(1 / 6) and texts(ax) == [f"q = {q:.4g}"]
+    with pytest.raises(ValueError, match="but they do not at this flip"):
+        plot.multiplier_circle(flip)
+    with pytest.raises(ValueError, match="finite"):
+        plot.multiplier_circle(belt.special[0])
