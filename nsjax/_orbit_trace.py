@@ -29,6 +29,10 @@ class Test(NamedTuple):
     slot: int = 0
 
 
+BRANCH = Test("branch")
+SINGULAR = 1e-3  # its value, beside that a step before, at which a fold is that of a branch point
+
+
 @dataclasses.dataclass
 class Spot:
     """A point of a branch: what is seen there, its course, and its multipliers."""
@@ -71,10 +75,10 @@ def midpoint(curve: OrbitCurve, spot: Spot, rows: Iterable[int]) -> tuple[float,
         held = any(course.mode[i, k] == (1 if k in curve.model.contacts else 0) for k in curve.model.holdable)
         length[i] = (look.end[i] - look.begin[i]) * (1e-6 if held else 1.0)
     best = next(i for i in length if length[i] >= (1 - 1e-6) * max(length.values()))
-    t = float(look.begin[best] + look.end[best]) / 2
+    t = np.asarray((look.begin[best] + look.end[best]) / 2)
     mode = np.asarray(course.mode[best])
     x = state_at(curve, look.parameter, look.begin[best], t, look.x[best], mode, course.part[best])
-    return t, np.asarray(x), mode
+    return float(t), np.asarray(x), mode
 
 
 def tests(curve: OrbitCurve, spot: Spot, scale: float) -> dict[Test, float]:
@@ -240,6 +244,8 @@ class OrbitTracer:
             if at is None and test.kind != "branch":
                 return None
             found += [] if at is None else [at._replace(test=test)]
+        # What turns round at a branch point that it crosses is no fold.
+        found = [z for z in found if z.test.kind != "fold" or abs(self.value(z.spot, BRANCH, scale)) > SINGULAR]
         found.sort(key=lambda zero: zero.s)
         out: list[Zero] = []
         for zero in found:
@@ -251,9 +257,7 @@ class OrbitTracer:
             out.append(zero)
         if out and out[-1].test.kind in (*CORNERS, "branch"):
             # A test function may pass its zero together with the corner's; it is the corner's then.
-            # (What crosses at a branch point may turn round there, and the point is known less exactly.)
-            near = 100 * NEAR if out[-1].test.kind == "branch" else NEAR
-            out = [z for z in out[:-1] if out[-1].s - z.s > near * length + 1e-9] + out[-1:]
+            out = [z for z in out[:-1] if out[-1].s - z.s > NEAR * length + 1e-9] + out[-1:]
         return out
 
     def told(self, zero: Zero, together: list[Zero]) -> Zero:

@@ -86,13 +86,13 @@ def stability_agrees(branch, system, number, seed, laps=40, **where):
             here = system(omega=float(part.values[i]), **where)
             y0 = jax.tree.map(lambda leaf, i=i: jnp.asarray(leaf[i]), part.ys)
             t0, period = float(part.ts[i]), float(part.periods[i])
-            moved = jax.tree.map(lambda leaf: leaf + 1e-5, y0)
+            moved = jax.tree.map(lambda leaf: leaf + 1e-7, y0)
             end = nsjax.solve(
                 here, t0, t0 + laps * period, moved, solver=dfx.Tsit5(), stepsize_controller=pid(1e-11),
                 max_steps=100_000, max_events=1000, throw=False,
             )  # fmt: skip
             away = max(abs(float(a) - float(b)) for a, b in zip(end.y1, y0))
-            assert (away < 1e-4) == bool(part.stable[i]), (part.values[i], rho[i], away)
+            assert (away < 1e-6) == bool(part.stable[i]), (part.values[i], rho[i], away)
             tried += 1
     return tried
 
@@ -171,7 +171,7 @@ def test_forced_stick_slip(belt):
     assert c.count in (((1, 2), (1,)), ((1,), (1, 2)))
     # I to V are one closed curve; VI and VII one of period 4, from B to the flip; VIII has period 8.
     closed, *others = belt.branches
-    assert "closed" in closed.ends[1] and len(closed.bifurcations if closed.others == () else closed.special) >= 6
+    assert "closed" in " ".join(closed.ends) and len(closed.special) == 6
     assert sorted(int(o.orders[0]) for o in others) == [4, 8]
 
 
@@ -181,7 +181,7 @@ def test_another_start(belt):
     orbit = orbit_of(system, Motion(2.11, -0.47), order=2)
     branch = continue_orbit(system, orbit, "omega", (1.5, 1.95))
     want, found = (sorted((b.kind, round(b.value, 9)) for b in x.bifurcations) for x in (belt, branch))
-    assert want == found
+    assert set(want) == set(found), set(want) ^ set(found)
 
 
 @pytest.mark.slow
