@@ -13,6 +13,7 @@ from ._orbit_curve import advance, Look, OrbitCurve, state_at
 
 
 FIRST, SHORTEST = 1e-3, 1e-9  # steps, in units of the curve
+UNSEEN = 1e-6  # steps that are not shortened any more for the sake of a branch point
 TURN = 0.15  # the angle between tangents that is aimed at
 NEAR = 1e-5  # zeros that are nearer to each other, in steps, are one
 VANISHES = 1e-6  # a test function that is smaller, where another one vanishes
@@ -240,8 +241,9 @@ class OrbitTracer:
             lost += [test] if zero is None else []
         for test in lost:
             # Beside a singular point, which another test function may know.
-            at = next((z for z in found if abs(tests(self.curve, z.spot, scale).get(test, np.inf)) < VANISHES), None)
-            if at is None and test.kind != "branch":
+            small = SINGULAR if test == BRANCH else VANISHES
+            at = next((z for z in found if abs(tests(self.curve, z.spot, scale).get(test, np.inf)) < small), None)
+            if at is None and (test != BRANCH or length > UNSEEN):
                 return None
             found += [] if at is None else [at._replace(test=test)]
         # What turns round at a branch point that it crosses is no fold.
