@@ -59,7 +59,8 @@ def continue_orbit(
 
     **Arguments:**
 
-    - `system`: the model. - `orbit`: an `Orbit` of it, from `find_orbit`.
+    - `system`: the model.
+    - `orbit`: an `Orbit` of it, from `find_orbit`.
     - `parameter`: the name of the parameter, a field of `system` or of a system within.
     - `interval`: of the parameter.
     - `scale`: the typical size of each component of the state, like the state; by default what it has along the orbit.

@@ -175,6 +175,8 @@ def named(
     halves: Sequence[OrbitHalf],
     surfaces: tuple[str, ...],
     monodromies: tuple[np.ndarray, np.ndarray],
+    multipliers: tuple[np.ndarray, np.ndarray],
+    transition: str | None,
 ) -> OrbitBifurcation:
     """A corner, by the number of orbits on each side, and by the crossings of the unit circle (Conjecture 6.2)."""
     names = {"+1": "fold", "-1": "flip", "pair": "Neimark-Sacker"}
@@ -189,16 +191,9 @@ def named(
         pairs = [k for k in by_crossing if k not in ("fold", "flip")]
         if kind == "none" and pairs:
             kind, evidence = pairs[0], "crossing"
-    values = tuple(_sorted(np.linalg.eigvals(m)) for m in monodromies)
-    slides = any(" +0" in h.itinerary for h in halves) and not all(" +0" in h.itinerary for h in halves)
-    counts = {h.itinerary.count(" +0") for h in halves if h.laps == 1}
     return OrbitBifurcation(
         kind=kind, discontinuous=True, criticality=by_count.criticality, evidence=evidence, by_count=by_count.kind,
-        by_crossing=by_crossing, transition="sliding" if slides or len(counts) > 1 else None,
+        by_crossing=by_crossing, transition=transition,
         count=(by_count.below, by_count.above), surfaces=surfaces, crossings=crossings or [], halves=halves,
-        multipliers=(values[0], values[1]), monodromies=monodromies, **_common(name, spot, curve),
+        multipliers=multipliers, monodromies=monodromies, **_common(name, spot, curve),
     )  # fmt: skip
-
-
-def _sorted(values: np.ndarray) -> np.ndarray:
-    return values[np.argsort(-np.abs(values))]

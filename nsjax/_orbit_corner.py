@@ -9,7 +9,7 @@ import numpy as np
 
 from ._course import Course, EVENT, FREE, LEAST, Start, start_from, TIME
 from ._crossings import eigenvalue_crossings
-from ._cycles import corner_kind, Cycle, Cycles, find_cycles
+from ._cycles import corner_kind, CornerMap, Cycle, Cycles, find_cycles
 from ._orbit_bifurcation import named, OrbitBifurcation
 from ._orbit_curve import linearised, OrbitCurve, with_parameter
 from ._orbit_node import (
@@ -27,6 +27,7 @@ from ._orbit_node import (
 )
 from ._orbit_trace import CORNERS, OrbitTracer, Spot, Test, turned, Zero
 from ._return_map import Base, follow, frame, return_map, ReturnMap, Touch, touches_of
+from ._system import impact
 
 
 DEPARTURES = (1e-4, 1e-5, 1e-3)  # at which a half-branch is entered: changes of the parameter, in its interval
@@ -52,7 +53,8 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
     if kind == "guard":
         return _end(tracer, name, zero)
     rows = [t.row for t in (zero.test, *zero.others) if t.kind == kind]
-    if kind == "rate":
+    bounces = kind == "rate" and all(_is_impact(curve, spot, row) for row in rows)
+    if kind == "rate" and not bounces:
         node = repelled_at(tracer, name, spot, rows)
         return node or _end(tracer, name, zero)
     touches = touches_of(spot, rows)
@@ -62,12 +64,18 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
     if found_map is None or found_map[0].jumps:
         return _end(tracer, name, zero)
     mapped, points = found_map
-    cycles = cycles_of(mapped, most)
+    arrived = tuple(1 if kind == "duration" or bounces else 0 for _ in touches)
+    cycles = cycles_of(mapped, most) if mapped.corner.e.any() else _through(mapped.corner, zero.side, arrived)
     halves = [half for cycle in cycles.cycles if (half := half_of(tracer, spot, mapped, points, cycle)) is not None]
     _pair(halves)
-    arrived = tuple(1 if kind in ("duration",) else 0 for _ in touches)
     made = described(name, curve, spot, mapped, cycles, halves, touches, arrived)
     return Node(spot, int(curve.order), halves, made)
+
+
+def _is_impact(curve: OrbitCurve, spot: Spot, row: int) -> bool:
+    """Whether a segment ends with an impact: one that becomes a grazing does nothing any more."""
+    slot = curve.model.slots[int(spot.course.slot[row])]
+    return isinstance(curve.model.switches[slot.switch], impact) and not slot.holding
 
 
 def cycles_of(mapped: ReturnMap, most: int) -> Cycles:
@@ -78,6 +86,24 @@ def cycles_of(mapped: ReturnMap, most: int) -> Cycles:
         except ValueError:  # it has none
             pass
     return find_cycles(mapped.corner, most, rtol=KNOWN)
+
+
+def _through(corner: CornerMap, side: int, arrived: tuple[int, ...]) -> Cycles:
+    """Where the event has no effect to leading order there is one orbit on each side; on which the event happens is
+    seen from the branch that came."""
+    m, n = corner.b.shape
+    step, shift, before = np.eye(n), np.zeros(n), []
+    for p in range(m):
+        before.append((step, shift))
+        step, shift = corner.a[p] @ step, corner.a[p] @ shift + corner.b[p]
+    x = np.linalg.solve(np.eye(n) - step, shift)
+    rates = np.stack([a @ x + b for a, b in before])
+    rho = np.linalg.eigvals(step)
+    rho = rho[np.argsort(-np.abs(rho))].astype(complex)
+    none, stable = np.zeros(m), bool(np.all(np.abs(rho) < 1))
+    words = ((side, arrived), (-side, tuple(1 - w for w in arrived)))
+    found = tuple(Cycle(s, 1, word, s * rates, none, none, rho, stable) for s, word in words)
+    return Cycles(found, (), (), 1, 2)
 
 
 def _pair(halves: list[Half]) -> None:
@@ -128,10 +154,40 @@ def described(
             curve.model.switches[curve.model.slots[int(spot.course.slot[t.row])].switch].name for t in touches
         )
     )
-    monodromies = tuple(_monodromy(mapped, word) for word in words)
+    square = np.resize(mapped.corner.square, len(arrived))
+    infinite = [bool(np.any(square & np.array(word, bool))) for word in words]
+    monodromies = [_monodromy(mapped, word) for word in words]
+    monodromies = [np.full_like(m, np.inf) if lost else m for m, lost in zip(monodromies, infinite)]
+    alone = {h.cycle.word: h.multipliers for h in halves if h.laps == 1 and h.cycle is not None}
+    values = [alone[w] if lost and w in alone else _multipliers(m) for w, m, lost in zip(words, monodromies, infinite)]
     return named(
-        by_count, crossings if finite else None, name, spot, curve, [told(h) for h in halves], surfaces, monodromies
+        by_count,
+        crossings if finite else None,
+        name,
+        spot,
+        curve,
+        [told(h) for h in halves],
+        surfaces,
+        (monodromies[0], monodromies[1]),
+        (values[0], values[1]),
+        "sliding" if len({_held(curve, h.spot) for h in halves if h.laps == 1}) > 1 else None,
     )
+
+
+def _held(curve: OrbitCurve, spot: Spot) -> int:
+    """How many segments a surface holds."""
+    mode, held = (
+        spot.course.mode[: int(spot.course.num)],
+        {k: int(k in curve.model.contacts) for k in curve.model.holdable},
+    )
+    return sum(any(row[k] == value for k, value in held.items()) for row in mode)
+
+
+def _multipliers(monodromy: np.ndarray) -> np.ndarray:
+    if not np.isfinite(monodromy).all():
+        return np.array([np.inf] + [np.nan] * (len(monodromy) - 1), complex)
+    values = np.linalg.eigvals(monodromy)
+    return values[np.argsort(-np.abs(values))]
 
 
 def _reduced(curve: OrbitCurve, monodromy: np.ndarray) -> np.ndarray:
@@ -180,11 +236,8 @@ def _foretold(curve: OrbitCurve, spot: Spot, points: list[Base], cycle: Cycle, d
     _, _, events, good = follow(curve, xs, values, np.asarray(spot.look.parameter), begins, stops, held)
     if not bool(np.all(np.asarray(good)[:count])):
         return None
-    slow = 1.0
-    if not curve.autonomous:
-        slow = float(with_parameter(curve.model, curve.path, jnp.asarray(value)).system.period) / float(
-            with_parameter(curve.model, curve.path, jnp.asarray(spot.look.parameter)).system.period
-        )
+    here, there = (with_parameter(curve.model, curve.path, jnp.asarray(v)).system for v in (spot.parameter, value))
+    slow = 1.0 if curve.autonomous else float(there.period) / float(here.period)
     rows = []
     for lane in range(count):
         lap = (lane // m) * period * slow
@@ -192,7 +245,7 @@ def _foretold(curve: OrbitCurve, spot: Spot, points: list[Base], cycle: Cycle, d
             after, before = tuple(e.mode_after.values()), tuple(e.mode_before.values())
             rows.append((float(e.t) + lap, e.switch, before, after, e.y_before, e.y_after))
     total = cycle.laps * period * slow
-    return start_from(curve.model.system, curve.like, rows, begin[0] * slow, total, x[0], modes[0])
+    return start_from(there, curve.like, rows, begin[0] * slow, total, x[0], modes[0])
 
 
 def _lane(events: Any, lane: int) -> Any:

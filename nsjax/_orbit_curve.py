@@ -24,12 +24,12 @@ from ._implicit import find_root
 from ._parameter import put_parameter
 from ._solution import is_okay
 from ._solve import solve
-from ._system import relay, System
+from ._system import impact, relay, System
 from ._types import Scalar, Y
 
 
-NODES = 64  # at which the guards of a segment are looked at
-TOLERANCE = 1e-12
+NODES = 64  # parts of a segment at whose ends its guards are looked at
+TOLERANCE = 1e-12  # of Newton's method, in units of the unknowns
 
 
 class _Varied(System):
@@ -193,7 +193,7 @@ class OrbitCurve(eqx.Module):
 
         def jump(t: Scalar, x: Array, mode: Array, part: Array, after: Array, slot: Array, ends: Array) -> tuple:
             out = (self.unravel(x), jnp.zeros_like(t))
-            if model.contacts or any(model.switches[k].__class__.__name__ == "impact" for k in range(len(model.parts))):
+            if any(isinstance(switch, impact) for switch in model.switches):
                 switch = jnp.asarray([s.switch for s in model.slots], jnp.int32)[slot]
                 k = jnp.where(ends == EVENT, switch, -1)
                 out = landing(model, k, t, self.unravel(x), self.state(mode, part), tuple(after))

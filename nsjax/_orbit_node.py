@@ -13,7 +13,7 @@ from ._orbit_curve import advance, linearised, OrbitCurve, state_at
 from ._orbit_trace import alike, CORNERS, OrbitTracer, Spot, spot_of, tests, turned
 
 
-BRANCHING = (3e-3, 1e-3, 1e-2, 3e-4)  # the same along the kernel of a smooth branch point
+BRANCHING = (3e-3, 1e-3, 1e-2, 3e-4)  # lengths of the step by which a branch is entered along its direction
 ALIKE = 1e-6  # two points that are nearer are one
 
 

@@ -112,12 +112,14 @@ def tests(curve: OrbitCurve, spot: Spot, scale: float) -> dict[Test, float]:
 
 
 class Zero(NamedTuple):
-    """The zero of a test function: where, and what else vanishes there."""
+    """The zero of a test function: where, what else vanishes there, and on which side of its parameter the branch was
+    before."""
 
     s: float
     test: Test
     spot: Spot
-    others: tuple[Test, ...]
+    others: tuple[Test, ...] = ()
+    side: int = 0
 
 
 @dataclasses.dataclass
@@ -254,7 +256,7 @@ class OrbitTracer:
             final = zero.test.kind not in PASSED
             if final:
                 together = [z for z in found if abs(z.s - zero.s) < NEAR * length + 1e-9 and z is not zero]
-                out.append(self.told(zero, together))
+                out.append(self.told(spot, zero, together))
                 break
             out.append(zero)
         if out and out[-1].test.kind in (*CORNERS, "branch"):
@@ -262,13 +264,14 @@ class OrbitTracer:
             out = [z for z in out[:-1] if out[-1].s - z.s > NEAR * length + 1e-9] + out[-1:]
         return out
 
-    def told(self, zero: Zero, together: list[Zero]) -> Zero:
+    def told(self, before: Spot, zero: Zero, together: list[Zero]) -> Zero:
         """What vanishes at one point, by the first of `CORNERS`."""
         rank = {kind: i for i, kind in enumerate((*CORNERS, "branch", "low", "high"))}
         several = sorted([zero, *together], key=lambda z: rank.get(z.test.kind, 99))
         first = several[0]
         others = tuple(dict.fromkeys(z.test for z in several[1:]))
-        return first._replace(others=others)
+        side = int(np.sign(before.parameter - first.spot.parameter))
+        return first._replace(others=others, side=side)
 
     def value(self, spot: Spot, test: Test, scale: float) -> float:
         found = tests(self.curve, spot, scale).get(test)
@@ -300,8 +303,8 @@ class OrbitTracer:
             # Beside its zero the equations are singular: the last that could be solved tells about where.
             s = min((s for s in seen if s > 0), key=lambda s: abs(tests(self.curve, seen[s], scale).get(test, np.inf)))
             found = self.interpolated(spot, s, length, chord, scale, test)
-            return None if found is None else Zero(found[0], test, found[1], ())
-        return Zero(s, test, seen[s], ())
+            return None if found is None else Zero(found[0], test, found[1])
+        return Zero(s, test, seen[s])
 
     def interpolated(
         self, spot: Spot, s: float, length: float, chord: Any, scale: float, test: Test

@@ -230,3 +230,72 @@ def test_mistakes(change, message):
     given = dict(parameter="v_dr", interval=(0.4, 0.6)) | change
     with pytest.raises(ValueError, match=message):
         continue_orbit(system, orbit, **given)
+
+
+class Stop(nsjax.System):
+    """x'' + c x' + x = cos ωt, x <= gap with restitution e."""
+
+    e: float = 0.7
+    c: float = 0.1
+    gap: float = 0.3
+    omega: float = 3.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, jnp.cos(self.omega * t) - self.c * y.v - y.x - s.stop)
+
+    @nsjax.impact
+    def stop(self, t, y):
+        return self.gap - y.x
+
+    @stop.restitution
+    def stop(self):
+        return self.e
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+class VanDerPol(nsjax.System):
+    """A self-excited mass before a visco-elastic wall."""
+
+    mu: float = 0.5
+    x_c: float = 2.2
+    k_f: float = 4.0
+    c_f: float = 0.5
+
+    def vector_field(self, t, y, s):
+        force = self.wall(t, y)[1] * (1 + s.wall) / 2
+        return Motion(y.v, self.mu * (1 - y.x**2) * y.v - y.x - force)
+
+    @nsjax.sgn
+    def wall(self, t, y):
+        return y.x - self.x_c, self.k_f * (y.x - self.x_c) + self.c_f * y.v
+
+
+@pytest.mark.slow
+def test_grazing_impact():
+    """A square-root corner: the linear orbit comes to touch the stop; beyond, it and orbits with impacts are found."""
+    system = Stop()
+    branch = continue_orbit(system, orbit_of(system, Motion(-0.12, 0.0)), "omega", (2.0, 3.1), max_laps=2)
+    square = np.roots([1, system.c**2 - 2, 1 - 1 / system.gap**2]).max()  # |1 - ω² + i c ω| = 1 / gap
+    point = the(branch, np.sqrt(square))
+    assert point.discontinuous and point.kind == "flip" and point.count == ((1,), (1, 2)) and point.by_crossing is None
+    free, bounced = sorted(point.multipliers, key=lambda rho: np.isinf(rho).any())
+    modulus = np.exp(-system.c * point.period / 2)
+    np.testing.assert_allclose(np.abs(free), modulus, rtol=1e-7)
+    assert np.isinf(bounced).sum() == 1
+    assert {int(b.orders[0]) for b in branch.branches} == {1, 2}
+
+
+@pytest.mark.slow
+def test_autonomous_corner():
+    """The limit cycle comes to touch the tip of a surface: what damps there only delays it, and nothing jumps."""
+    system = VanDerPol()
+    orbit = orbit_of(system, Motion(2.0, 0.0), period=6.3)
+    branch = continue_orbit(system, orbit, "x_c", (1.9, 2.3))
+    (point,) = branch.special_points
+    np.testing.assert_allclose(point.value, orbit.maximum(lambda t, y: y.x), atol=1e-10)
+    assert (point.kind, point.count, point.transition) == ("none", ((1,), (1,)), None)
+    same_multipliers(point.multipliers, (np.asarray(orbit.multipliers),) * 2)
+    assert len(branch.branches) == 1 and list(branch.values[[0, -1]]) == pytest.approx([1.9, 2.3])
