@@ -52,7 +52,10 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
     spot = zero.spot
     if kind == "guard":
         return _end(tracer, name, zero)
-    rows = [t.row for t in (zero.test, *zero.others) if t.kind == kind]
+    # Several places may be touched at once, by symmetry, and the event happen at some of them only.
+    together = ("duration", "margin") if kind in ("duration", "margin") else (kind,)
+    kinds = {t.row: t.kind for t in (*zero.others, zero.test) if t.kind in together}
+    rows = list(kinds)
     bounces = kind == "rate" and all(_is_impact(curve, spot, row) for row in rows)
     if kind == "rate" and not bounces:
         node = repelled_at(tracer, name, spot, rows)
@@ -64,7 +67,7 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
     if found_map is None or found_map[0].jumps:
         return _end(tracer, name, zero)
     mapped, points = found_map
-    arrived = tuple(1 if kind == "duration" or bounces else 0 for _ in touches)
+    arrived = tuple(int(kinds[t.row] == "duration" or bounces) for t in touches)
     cycles = cycles_of(mapped, most) if mapped.corner.e.any() else _through(mapped.corner, zero.side, arrived)
     halves = [half for cycle in cycles.cycles if (half := half_of(tracer, spot, mapped, points, cycle)) is not None]
     _pair(halves)

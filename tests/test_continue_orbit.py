@@ -145,6 +145,15 @@ def test_symmetry_breaking(friction):
     assert sum(abs(s.value - c.value) < 1e-8 for s in friction.others[0].special) == 2
 
 
+def test_from_the_branch_that_broke_the_symmetry(friction):
+    """At B one place has its stick phase vanish while at the other one is about to begin."""
+    system = gallery.ForcedFriction(omega=0.65)
+    branch = continue_orbit(system, orbit_of(system, Motion(4.0, 1.5)), "omega", (0.5, 0.85))
+    want, found = ({(b.kind, b.discontinuous, round(b.value, 9)) for b in x.special_points} for x in (friction, branch))
+    assert want == found and the(branch, POINTS["6.8 B"].at).count == ((1, 1, 1), (1,))
+    assert len(branch.branches) == 2
+
+
 @pytest.mark.slow
 def test_stability_by_simulation(friction, belt):
     assert stability_agrees(friction, gallery.ForcedFriction, 8, seed=1) > 5
