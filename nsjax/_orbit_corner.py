@@ -6,6 +6,7 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import toms748
 
 from ._course import Course, EVENT, FREE, LEAST, Start, start_from, TIME
 from ._crossings import eigenvalue_crossings
@@ -146,6 +147,10 @@ def described(
     by_count = corner_kind(cycles)
     finite = not mapped.corner.square.any()
     here = next((h for h in halves if h.laps == 1 and h.cycle is not None and h.cycle.word == arrived), None)
+    if here is not None and here.cycle is not None and here.cycle.image is not None and not _symmetric(here.cycle):
+        # One that broke the symmetry goes on into its image; the multipliers that tell are those of the symmetric ones.
+        here = next((h for h in halves if h.laps == 1 and h.cycle is not None and _symmetric(h.cycle)), here)
+        arrived = here.cycle.word if here.cycle is not None else arrived
     other = None if here is None else here.partner
     words = (arrived, tuple(1 - w for w in arrived) if other is None or other.cycle is None else other.cycle.word)
     crossings = []
@@ -355,8 +360,6 @@ def _component(curve: OrbitCurve, look: Any, course: Course, i: int, j: int, t: 
 
 def _zero_along(tracer: OrbitTracer, at: Spot, row: int) -> Spot | None:
     """The point of the curve, next to one, at which the guard at the end of a segment vanishes."""
-    from scipy.optimize import toms748
-
     seen = {0.0: at}
 
     def value(s: float) -> float:

@@ -186,7 +186,7 @@ def side_of(half: Spot, at: Spot, curve: OrbitCurve) -> int:
 
 def told(half: Half) -> OrbitHalf:
     spot = half.spot
-    return OrbitHalf(half.side, half.laps, half.multipliers, spot.stable, str(itinerary(half.curve, spot.course)))
+    return OrbitHalf(half.side, half.laps, half.multipliers, spot.stable, itinerary(half.curve, spot.course))
 
 
 def itinerary(curve: OrbitCurve, course: Course) -> str:

@@ -427,6 +427,6 @@ def forced_stick_slip_orbit(branch: str) -> Shot:
 
     I (stable) and V (λ > 1) stick once in the two periods; II (λ > 1), III (stable, complex) and IV (λ < -1) never do.
     Further from this ω: I and V meet in a fold between 1.682 and 1.684, V and IV end at B (ω = 1.668), IV becomes III
-    in a flip between 1.71 and 1.72, III and II meet in a fold near 1.912, II and I end at A (1.516)."""
+    in a flip between 1.71 and 1.72, III and II meet in a fold near 1.912, II and I end at A (1.514)."""
     omega, guess = STICK_SLIP[branch]
     return _forced(Belt(omega=mp.mpf(omega)).simulate, guess, 2, {"omega": omega})
