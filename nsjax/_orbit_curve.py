@@ -81,6 +81,7 @@ class Look(NamedTuple):
         ends; at which share of the segment; the largest value; and the state where it is least.
     - `low`, `high`: the least and the largest value of each component of the state; `mean`, `square`: its mean and that
         of its square over time.
+    - `ts`, `xs`: times and states along each segment.
     - `branch`: sign and logarithm of the determinant of the equations bordered by the tangent.
     - `residual`: the largest of the equations.
     """
@@ -109,6 +110,8 @@ class Look(NamedTuple):
     high: Array
     mean: Array
     square: Array
+    ts: Array
+    xs: Array
     branch: Array
     residual: Scalar
 
@@ -311,7 +314,8 @@ class OrbitCurve(eqx.Module):
         rates, values, margins = self._at_ends(model, end, last, course)
         return Look(
             u, tangent, good & jnp.all(jnp.isfinite(tangent)), value, period, begin, end, x, last, factors, *found,
-            rates, values, margins, least, where, most, spots, low, high, mean, square, branch, jnp.max(jnp.abs(f)),
+            rates, values, margins, least, where, most, spots, low, high, mean, square, ts, xs, branch,
+            jnp.max(jnp.abs(f)),
         )  # fmt: skip
 
     def _least(
