@@ -21,7 +21,7 @@ from ._cuts import landing
 from ._filippov import Model, State
 from ._floquet import floquet, structural_zeros
 from ._implicit import find_root
-from ._parameter import put_parameter
+from ._parameter import Path, put_parameter
 from ._solution import is_okay
 from ._solve import solve
 from ._system import impact, relay, System
@@ -36,7 +36,7 @@ class _Varied(System):
     """A state, the parameter, and the derivatives of the state by those at the beginning, in one mode."""
 
     model: Model
-    path: tuple[str, ...] = eqx.field(static=True)
+    path: Path = eqx.field(static=True)
     state: State
 
     def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
@@ -54,8 +54,8 @@ class _Summed(System):
     """The field of one mode, for one value of the parameter; and the integrals of the state and of its squares."""
 
     model: Model
-    path: tuple[str, ...] = eqx.field(static=True)
-    value: Scalar
+    path: Path = eqx.field(static=True)
+    value: Array
     state: State
 
     def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
@@ -63,14 +63,15 @@ class _Summed(System):
         return with_parameter(self.model, self.path, self.value).flow(t, y, self.state), y, jax.tree.map(jnp.square, y)
 
 
-def with_parameter(model: Model, path: tuple[str, ...], value: Scalar) -> Model:
+def with_parameter(model: Model, path: Path, value: Array) -> Model:
     return eqx.tree_at(lambda m: m.system, model, put_parameter(model.system, path, value))
 
 
 class Look(NamedTuple):
     """All that is seen of a point of the curve.
 
-    - `u`, `tangent`: the unknowns, and the direction of the curve; `good`: whether it is a point of the curve.
+    - `u`, `tangent`: the unknowns, and the direction of the curve (of a surface, several); `good`: whether it is a
+        point of the curve.
     - `parameter`, `period`; `begin`, `end`, `x`, `last`: of the segments: times, and states at beginnings and ends.
     - `factors`: the derivatives from the beginning of each segment to that of the next, at the same time; `monodromy`,
         `multipliers`, `stable`: what follows.
@@ -89,7 +90,7 @@ class Look(NamedTuple):
     u: Array
     tangent: Array
     good: Bool[Array, ""]
-    parameter: Scalar
+    parameter: Array
     period: Scalar
     begin: Array
     end: Array
@@ -118,13 +119,16 @@ class Look(NamedTuple):
 
 class OrbitCurve(eqx.Module):
     """The equations; what is unknown is measured in `sizes` (state), `time`, and `width`, the interval of the parameter
-    from `low` on."""
+    from `low` on.
+
+    With several parameters (`path` holds their paths, and `low` and `width` are vectors) their orbits are a surface.
+    """
 
     model: Model
-    path: tuple[str, ...] = eqx.field(static=True)
+    path: Path = eqx.field(static=True)
     like: Y
-    low: Scalar
-    width: Scalar
+    low: Float[Array, "*parameters"]
+    width: Float[Array, "*parameters"]
     sizes: Float[Array, " n"]
     time: Scalar
     guard_sizes: Float[Array, " slots"]  # what a unit of the unknowns makes of each guard
@@ -137,15 +141,20 @@ class OrbitCurve(eqx.Module):
     def autonomous(self) -> bool:
         return self.model.system.period is None
 
+    @property
+    def dimension(self) -> int:
+        """That of the curve, or surface: how many parameters vary."""
+        return int(np.size(self.low))
+
     def unravel(self, x: Array) -> Y:
         return jfu.ravel_pytree(self.like)[1](x)
 
-    def parts(self, u: Array) -> tuple[Array, Array, Array, Scalar]:
+    def parts(self, u: Array) -> tuple[Array, Array, Array, Array]:
         """Times of beginning and end, states at the beginnings, parameter."""
-        n = len(self.sizes)
-        rows = (len(u) - 1) // (n + 2)
-        z = u[:-1].reshape(rows, n + 2)
-        return z[:, 0] * self.time, z[:, 1] * self.time, z[:, 2:] * self.sizes, self.low + u[-1] * self.width
+        n, m = len(self.sizes), self.dimension
+        z = u[:-m].reshape(-1, n + 2)
+        value = self.low + u[-m:].reshape(jnp.shape(self.low)) * self.width
+        return z[:, 0] * self.time, z[:, 1] * self.time, z[:, 2:] * self.sizes, value
 
     def pack(self, start: Start, value: Any) -> Array:
         capacity, n = len(start.course.slot), len(self.sizes)
@@ -156,7 +165,7 @@ class OrbitCurve(eqx.Module):
             if i > j:
                 z[i, :2] = start.end[j]
         z /= np.array([float(self.time)] * 2 + np.asarray(self.sizes).tolist())
-        return jnp.append(jnp.asarray(z).ravel(), (jnp.asarray(value) - self.low) / self.width)
+        return jnp.append(jnp.asarray(z).ravel(), jnp.ravel((jnp.asarray(value) - self.low) / self.width))
 
     def state(self, mode: Array, part: Array) -> State:
         model = self.model
@@ -230,12 +239,12 @@ class OrbitCurve(eqx.Module):
         finish = jax.vmap(ended)(begin, end, x, last, mode, part, course.slot, course.entry, course.ends)
         # In the units of the unknowns.
         whole = jnp.concatenate([started[:, None] / self.time, finish[:, None], (x - after[before]) / self.sizes], 1)
-        fill = (u - lax.stop_gradient(origin))[:-1].reshape(rows, -1)
+        fill = (u - lax.stop_gradient(origin))[: -self.dimension].reshape(rows, -1)
         return jnp.where(happened[:, None], whole, fill).ravel(), arrival[0] / self.time, last
 
     def look(self, u: Array, border: Array, course: Course, origin: Array, good: Array) -> Look:
         begin, end, x, value = self.parts(u)
-        n, rows = len(self.sizes), len(begin)
+        n, rows, m = len(self.sizes), len(begin), self.dimension
         model = with_parameter(self.model, self.path, value)
 
         def equations(u: Array) -> tuple[tuple[Array, Scalar], tuple[Array, Array]]:
@@ -244,10 +253,14 @@ class OrbitCurve(eqx.Module):
 
         (df, closing), (f, last) = jax.jacfwd(equations, has_aux=True)(u)
         scaled = df / _row_sizes(df)[:, None]
-        whole = jnp.concatenate([scaled, border[None]])
-        tangent = jnp.linalg.solve(whole, jnp.zeros_like(u).at[-1].set(1))
-        tangent = tangent / jnp.linalg.norm(tangent)
-        branch = jnp.stack(jnp.linalg.slogdet(jnp.concatenate([df, tangent[None]])))
+        whole = jnp.concatenate([scaled, jnp.atleast_2d(border)])
+        along = jnp.linalg.solve(whole, jnp.eye(len(u), m, m - len(u), dtype=u.dtype)).T
+        if m == 1:
+            along = along / jnp.linalg.norm(along)
+        else:
+            along = jnp.linalg.solve(jnp.linalg.cholesky(along @ along.T), along)
+        branch = jnp.stack(jnp.linalg.slogdet(jnp.concatenate([df, along])))
+        tangent = along.reshape(jnp.shape(border))
 
         # Derivatives from segment to segment at the same time: the blocks of DF, the moved times eliminated.
         index = jnp.arange(rows, dtype=course.num.dtype)
@@ -260,13 +273,13 @@ class OrbitCurve(eqx.Module):
             * self.time
             / self.sizes
         )
-        blocks = df[:, :-1].reshape(rows, n + 2, rows, n + 2)
+        blocks = df[:, :-m].reshape(rows, n + 2, rows, n + 2)
         own, on = blocks[index, :, index], blocks[after, :, index]
         # The next segment of the last one begins where it ends; of a single one it is the same.
         itself = jnp.zeros(n + 2, u.dtype).at[2:].set(1)
         on = jnp.where(course.num == 1, on - jnp.diag(itself), on)
         final = (index == course.num - 1)[:, None]
-        on = on.at[:, 0].set(jnp.where(final, -closing[:-1].reshape(rows, n + 2), on[:, 0]))
+        on = on.at[:, 0].set(jnp.where(final, -closing[:-m].reshape(rows, n + 2), on[:, 0]))
         on = jnp.where((course.ends == TIME)[:, None, None], on.at[:, 0].set(0), on)
 
         def factor(own: Array, on: Array, ends: Array, last_field: Array) -> Array:
@@ -466,8 +479,8 @@ def _arrive_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     *_, da, db, dx, dvalue, _ = tangents
     unravel = jfu.ravel_pytree(like)[1]
     n = len(x)
-    eye = jnp.eye(n + 1, dtype=x.dtype)
-    columns = (jax.vmap(unravel)(eye[:, :n]), eye[:, n])
+    eye = jnp.eye(n + value.size, dtype=x.dtype)
+    columns = (jax.vmap(unravel)(eye[:, :n]), eye[:, n:].reshape(-1, *value.shape))
     varied = _Varied(model, path, state)
     sol = solve(varied, a, b, (unravel(x), value, columns), saveat=dfx.SaveAt(t1=True), throw=False, **dict(how))
     y, _, (along, _) = sol.y1
@@ -482,7 +495,7 @@ def _arrive_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     if da is not None:
         out = out - phi[:, :n] @ jfu.ravel_pytree(here.flow(a, unravel(x), state))[0] * da
     if dvalue is not None:
-        out = out + phi[:, n] * dvalue
+        out = out + phi[:, n:] @ jnp.ravel(dvalue)
     return end, out
 
 
@@ -490,7 +503,8 @@ def _arrive_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
 def advance(
     curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array, newton: Array | bool = True
 ) -> Look:
-    """The point of the curve at the distance `s` from `origin` along `border`, and all that is seen of it; or, without
+    """The point of the curve at the distance `s` from `origin` along `border` (of a surface, at several distances along
+    as many directions), and all that is seen of it; or, without
     `newton`, of the guess itself."""
 
     def residual(u: Array, _: Any) -> Array:
@@ -502,7 +516,7 @@ def advance(
 
 
 @eqx.filter_jit
-def state_at(curve: OrbitCurve, value: Scalar, a: Scalar, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
+def state_at(curve: OrbitCurve, value: Array, a: Scalar, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
     """The state at a time in a segment. (Between steps the states of a `Look` are those of the solver's dense output,
     less exact than the steps.)"""
     return _arrive(curve.model, curve.path, curve.how, curve.like, a, t, x, value, curve.state(mode, part))

@@ -10,6 +10,9 @@ import jax.numpy as jnp
 from ._system import System
 
 
+Path = tuple[str, ...] | tuple[tuple[str, ...], ...]  # of one parameter, or of several
+
+
 def parameter_path(system: System, name: Any) -> tuple[str, ...]:
     """Where the parameter is: its own name, or, for one of a system that another one wraps, as `smoothed` does, with
     those of the fields that lead there. `system.mu` says so expressly.
@@ -50,5 +53,10 @@ def get_parameter(system: System, path: tuple[str, ...]) -> Any:
     return ft.reduce(getattr, path, system)
 
 
-def put_parameter(system: System, path: tuple[str, ...], value: Any) -> System:
+def put_parameter(system: System, path: Path, value: Any) -> System:
+    """With another value of a parameter; or of several, from a vector."""
+    if path and not isinstance(path[0], str):
+        for i, one in enumerate(path):
+            system = put_parameter(system, one, value[i])
+        return system
     return eqx.tree_at(lambda m: get_parameter(m, path), system, value)
