@@ -6,6 +6,7 @@ from ._branch import Branch as Branch
 from ._brute_force import brute_force as brute_force, BruteForce as BruteForce
 from ._continue_equilibrium import continue_equilibrium as continue_equilibrium
 from ._continue_orbit import continue_orbit as continue_orbit, OrbitGrowth as OrbitGrowth
+from ._continue_orbits import continue_orbits as continue_orbits, OrbitBranches as OrbitBranches
 from ._crossings import (
     eigenvalue_crossings as eigenvalue_crossings,
     eigenvalue_path as eigenvalue_path,

@@ -21,6 +21,7 @@ from ._orbit_curve import guard_sizes, OrbitCurve
 from ._orbit_node import Half, itinerary, Node, tracer_for
 from ._orbit_trace import alike, Arc, OrbitTracer, SAME, Spot, turned, Zero
 from ._parameter import get_parameter, parameter_path
+from ._segment_flow import exactness
 from ._solution import is_okay
 from ._system import arrays_of, System
 from ._types import Y
@@ -162,6 +163,7 @@ class OrbitGrowth:
             normal=np.zeros_like(sizes),
             reference=np.asarray(flat),
             how=how,
+            exact=exactness(model, jnp.asarray(orbit.t0), orbit.y0),
         )
         if system.period is None:
             state = curve.state(jnp.asarray(start.course.mode[0]), jnp.asarray(start.course.part[0]))

@@ -86,14 +86,14 @@ class Exponential(dfx.AbstractAdaptiveSolver):
         return y1, error, dict(y0=y0, points=stack(_control_points(ys))), None, dfx.RESULTS.successful
 
 
-def _affine(field: Callable[[Scalar, Y], Y], t: Scalar, y: Y) -> tuple[bool, bool]:
+def affine_parts(field: Callable[[Scalar, Y], Y], t: Scalar, y: Y) -> tuple[bool, bool]:
     """Whether a field is affine in the state, and whether its matrix is constant in time."""
     dy = jax.tree.map(jnp.ones_like, y)
     return is_affine(lambda y: field(t, y), y), is_constant(lambda t: jax.jvp(lambda y: field(t, y), (y,), (dy,))[1], t)
 
 
 def _check_affine(field: Callable[[Scalar, Y], Y], t: Scalar, y: Y, name: str) -> None:
-    affine, constant = _affine(field, t, y)
+    affine, constant = affine_parts(field, t, y)
     if not affine:
         raise ValueError(
             f"`Exponential` needs a field that is affine in the state, but {name} is not. Take `nsjax.Taylor()` or a "
@@ -106,7 +106,7 @@ def _check_affine(field: Callable[[Scalar, Y], Y], t: Scalar, y: Y, name: str) -
         )
 
 
-def _generator(
+def generator(
     field: Callable[[Scalar, Flat], Flat], t: Scalar, x: Flat, f: Flat, dt: Scalar
 ) -> tuple[Square, Scalar, Bool[Array, ""]]:
     """The matrix M of a linear system z' = M z with time in units of `dt`, whose first components times the second
@@ -185,7 +185,7 @@ def _sampled(
     def flat(t: Scalar, x: Flat) -> Flat:
         return jfu.ravel_pytree(field(t, unravel(x)))[0]
 
-    m, scale, fits = _generator(flat, t, x, jfu.ravel_pytree(f)[0], dt)
+    m, scale, fits = generator(flat, t, x, jfu.ravel_pytree(f)[0], dt)
     half = expm(m / (2 * _N))
     whole = half @ half
     z = [jnp.zeros(len(m), x.dtype).at[len(x)].set(1)]
@@ -230,7 +230,7 @@ class ExponentialStepper(Stepper):
     def made_for(self, model: Model, state: State, t: Scalar, y: Y) -> "ExponentialStepper":
         s = model.signs(t, state)
         _check_affine(lambda t, y: model.field(t, y, s), t, y, f"`{type(model.system).__name__}`")
-        slides = all(_affine(lambda t, y: model.flow(t, y, state), t, y))
+        slides = all(affine_parts(lambda t, y: model.flow(t, y, state), t, y))
         return ExponentialStepper(self.solver, slides)
 
     def __call__(

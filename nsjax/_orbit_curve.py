@@ -4,9 +4,9 @@ The states and times of all events are unknown. So the curve is smooth where the
 segment has no length, and on surfaces that repel.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
@@ -15,56 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ._arcs import Smooth
 from ._course import Course, EVENT, FREE, LEAST, Start, TIME
 from ._cuts import landing
 from ._filippov import Model, State
 from ._floquet import floquet, structural_zeros
 from ._implicit import find_root
-from ._parameter import Path, put_parameter
-from ._solution import is_okay
-from ._solve import solve
-from ._system import impact, relay, System
+from ._parameter import Path
+from ._segment_flow import ALWAYS, NEVER, SegmentFlow, THETA, with_parameter
+from ._system import impact, relay
 from ._types import Scalar, Y
 
 
-NODES = 64  # parts of a segment at whose ends its guards are looked at
 TOLERANCE = 1e-12  # of Newton's method, in units of the unknowns
-
-
-class _Varied(System):
-    """A state, the parameter, and the derivatives of the state by those at the beginning, in one mode."""
-
-    model: Model
-    path: Path = eqx.field(static=True)
-    state: State
-
-    def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
-        y, value, columns = y
-
-        def rhs(y: Y, value: Scalar) -> Y:
-            return with_parameter(self.model, self.path, value).flow(t, y, self.state)
-
-        along, moved = columns
-        change = jax.vmap(lambda dy, dv: jax.jvp(rhs, (y, value), (dy, dv))[1])(along, moved)
-        return rhs(y, value), jnp.zeros_like(value), (change, jnp.zeros_like(moved))
-
-
-class _Summed(System):
-    """The field of one mode, for one value of the parameter; and the integrals of the state and of its squares."""
-
-    model: Model
-    path: Path = eqx.field(static=True)
-    value: Array
-    state: State
-
-    def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
-        y, _, _ = y
-        return with_parameter(self.model, self.path, self.value).flow(t, y, self.state), y, jax.tree.map(jnp.square, y)
-
-
-def with_parameter(model: Model, path: Path, value: Array) -> Model:
-    return eqx.tree_at(lambda m: m.system, model, put_parameter(model.system, path, value))
 
 
 class Look(NamedTuple):
@@ -136,6 +98,23 @@ class OrbitCurve(eqx.Module):
     normal: Float[Array, " n"]  # the phase condition of an autonomous orbit without events
     reference: Float[Array, " n"]
     how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    exact: int = eqx.field(static=True)  # which flows are known by their exponentials
+    slides: bool = eqx.field(static=True, default=True)  # whether surfaces hold segments of the course
+
+    def on(self, course: Course) -> "OrbitCurve":
+        """With flows as the modes of a course allow."""
+        held = {k: int(k in self.model.contacts) for k in self.model.holdable}
+        modes = np.asarray(course.mode)[: int(course.num)]
+        slides = any(bool(np.any(modes[:, k] == value)) for k, value in held.items())
+        return self.sliding(slides)
+
+    def sliding(self, slides: bool) -> "OrbitCurve":
+        exact = NEVER if slides and self.exact != ALWAYS else self.exact
+        return dataclasses.replace(self, exact=exact, slides=slides)
+
+    @property
+    def flow(self) -> SegmentFlow:
+        return SegmentFlow(self.model, self.path, self.like, self.how, self.exact != NEVER, self.slides)
 
     @property
     def autonomous(self) -> bool:
@@ -199,7 +178,7 @@ class OrbitCurve(eqx.Module):
         following = jnp.where(final[:, None], mode[:1], jnp.roll(mode, -1, axis=0))
 
         def row(a: Scalar, b: Scalar, x: Array, mode: Array, part: Array) -> Array:
-            return _arrive(self.model, self.path, self.how, self.like, a, b, x, value, self.state(mode, part))
+            return self.flow.arrive(a, b, x, value, self.state(mode, part))
 
         last = jax.vmap(row)(begin, end, x, mode, part)
 
@@ -232,7 +211,7 @@ class OrbitCurve(eqx.Module):
                         here = jnp.asarray([s.switch == k for s in model.slots])[slot]
                         holding = jnp.where(here, holding - model.bound(k), holding)
                 out = jnp.where(ends == FREE, holding, out)
-            out = out / (self.guard_sizes[slot] if model.slots else 1)
+            out = out / (jnp.asarray(self.guard_sizes)[slot] if model.slots else 1)
             closing = self.normal @ (x - self.reference) if forced is None else b - a - forced
             return jnp.where(ends == TIME, closing, out)
 
@@ -299,20 +278,10 @@ class OrbitCurve(eqx.Module):
         found = floquet(factors, zeros, self.autonomous)
 
         # Along the way.
-        theta = jnp.asarray(0.5 - 0.5 * np.cos(np.pi * np.arange(NODES + 1) / NODES), u.dtype)
+        theta = jnp.asarray(THETA, u.dtype)
 
         def path(a: Scalar, b: Scalar, x: Array, mode: Array, part: Array) -> tuple[Array, Array, Array]:
-            summed = _Summed(self.model, self.path, value, self.state(mode, part))
-            span = jnp.abs(b - a)
-            ts = jnp.clip(a + (b - a) * theta, jnp.minimum(a, b), jnp.maximum(a, b))
-            # Of a segment without length every point is its beginning.
-            far = jnp.where(span > 0, b, a + 1e-9 * self.time)
-            save = jnp.where(span > 0, ts, a)
-            none = jax.tree.map(jnp.zeros_like, self.like)
-            saveat = dfx.SaveAt(subs=dfx.SubSaveAt(ts=save, fn=lambda t, y, args: y[0]))
-            sol = solve(summed, a, far, (self.unravel(x), none, none), saveat=saveat, throw=False, **dict(self.how))
-            sums = jnp.stack([jfu.ravel_pytree(part)[0] for part in sol.y1[1:]])
-            return ts, jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys), jnp.where(span > 0, sums, 0)
+            return self.flow.along(a, b, x, value, self.state(mode, part))
 
         ts, xs, sums = jax.vmap(path)(begin, end, x, mode, part)
         inside = (index < course.num)[:, None]
@@ -463,49 +432,27 @@ def _row_sizes(df: Array) -> Array:
     return jnp.where(sizes == 0, 1, sizes)
 
 
-@eqx.filter_custom_jvp
-def _arrive(model: Any, path: Any, how: Any, like: Any, a: Any, b: Any, x: Any, value: Any, state: Any) -> Array:
-    """The state at time b of the flow in one mode from `x` at time a."""
-    unravel = jfu.ravel_pytree(like)[1]
-    smooth = Smooth(with_parameter(model, path, value), state)
-    sol = solve(smooth, a, b, unravel(x), saveat=dfx.SaveAt(t1=True), throw=False, **dict(how))
-    return jnp.where(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0], jnp.nan)
-
-
-@_arrive.def_jvp
-def _arrive_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    """By the variational equation; by the times exactly, as the flow knows no beginning."""
-    model, path, how, like, a, b, x, value, state = primals
-    *_, da, db, dx, dvalue, _ = tangents
-    unravel = jfu.ravel_pytree(like)[1]
-    n = len(x)
-    eye = jnp.eye(n + value.size, dtype=x.dtype)
-    columns = (jax.vmap(unravel)(eye[:, :n]), eye[:, n:].reshape(-1, *value.shape))
-    varied = _Varied(model, path, state)
-    sol = solve(varied, a, b, (unravel(x), value, columns), saveat=dfx.SaveAt(t1=True), throw=False, **dict(how))
-    y, _, (along, _) = sol.y1
-    end = jnp.where(is_okay(sol.result), jfu.ravel_pytree(y)[0], jnp.nan)
-    phi = jax.vmap(lambda c: jfu.ravel_pytree(c)[0], out_axes=1)(along)
-    here = with_parameter(model, path, value)
-    out = jnp.zeros_like(x)
-    if db is not None:
-        out = out + jfu.ravel_pytree(here.flow(b, y, state))[0] * db
-    if dx is not None:
-        out = out + phi[:, :n] @ dx
-    if da is not None:
-        out = out - phi[:, :n] @ jfu.ravel_pytree(here.flow(a, unravel(x), state))[0] * da
-    if dvalue is not None:
-        out = out + phi[:, n:] @ jnp.ravel(dvalue)
-    return end, out
-
-
-@eqx.filter_jit
 def advance(
     curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array, newton: Array | bool = True
 ) -> Look:
     """The point of the curve at the distance `s` from `origin` along `border` (of a surface, at several distances along
     as many directions), and all that is seen of it; or, without
     `newton`, of the guess itself."""
+
+    return _advance(curve.on(course), course, origin, border, s, guess, np.asarray(newton))
+
+
+@eqx.filter_jit
+def _advance(
+    curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array, newton: Array
+) -> Look:
+    return step_on(curve, course, origin, border, s, guess, newton)
+
+
+def step_on(
+    curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array, newton: Array | bool = True
+) -> Look:
+    """`advance`, within a program."""
 
     def residual(u: Array, _: Any) -> Array:
         off = jnp.append(curve.residual(u, course, origin)[0], border @ (u - origin) - s)
@@ -519,11 +466,15 @@ def advance(
 def state_at(curve: OrbitCurve, value: Array, a: Scalar, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
     """The state at a time in a segment. (Between steps the states of a `Look` are those of the solver's dense output,
     less exact than the steps.)"""
-    return _arrive(curve.model, curve.path, curve.how, curve.like, a, t, x, value, curve.state(mode, part))
+    return curve.flow.arrive(a, t, x, value, curve.state(mode, part))
+
+
+def linearised(curve: OrbitCurve, course: Course, u: Array) -> Array:
+    """The derivatives of the equations, row by row of size one."""
+    return _linearised(curve.on(course), course, u)
 
 
 @eqx.filter_jit
-def linearised(curve: OrbitCurve, course: Course, u: Array) -> Array:
-    """The derivatives of the equations, row by row of size one."""
+def _linearised(curve: OrbitCurve, course: Course, u: Array) -> Array:
     df = jax.jacfwd(lambda v: curve.residual(v, course, u)[0])(u)
     return df / _row_sizes(df)[:, None]

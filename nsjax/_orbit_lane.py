@@ -1,0 +1,249 @@
+"""A branch of periodic orbits as one compiled loop: a lane among thousands that are followed at once."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ._course import Course, EVENT, FREE, LEAST
+from ._floquet import trivial
+from ._orbit_curve import Look, OrbitCurve, step_on
+from ._types import Scalar
+
+
+FIRST, SHORTEST = 1e-3, 1e-9  # steps, in units of the curve
+TURN, TURNED = 0.15, 0.5  # the angles between tangents that are aimed at, and allowed
+TRIES = 40  # to locate one zero
+# What a lane is doing, and how it ended.
+STEPPING, LOCATING, ENDED, LOST, NO_ORBIT = range(5)
+PASSED = ("fold", "branch point", "flip", "Neimark-Sacker")  # zeros through which the branch goes on
+ENDS = ("low", "high")
+CORNERS = ("tangency", "margin", "duration", "grazing")  # of each segment, the last of each guard too
+
+
+class Row(NamedTuple):
+    """What is kept of an orbit."""
+
+    parameter: Scalar
+    period: Scalar
+    t: Scalar
+    x: Array
+    low: Array
+    high: Array
+    multipliers: Array
+    stable: Bool[Array, ""]
+
+
+class Place(NamedTuple):
+    """A point of the curve, and what the test functions are there."""
+
+    u: Array
+    tangent: Array
+    log: Scalar  # of the determinant, by which that of the next points is divided
+    values: Array
+    row: Row
+
+
+class Lane(NamedTuple):
+    at: Place
+    far: Place  # the step in which zeros are being located
+    length: Scalar  # of the step
+    doing: Int[Array, ""]
+    wanted: Bool[Array, " tests"]  # zeros still to be located
+    target: Int[Array, ""]
+    near: Array  # the bracket: distance and value at its ends
+    off: Array
+    tries: Int[Array, ""]
+    end: Scalar  # distance in this step of the first zero at which the branch ends
+    arc: Scalar  # length of the curve so far
+    rows: Row
+    arcs: Float[Array, " points"]
+    kinds: Int[Array, " points"]  # -1: an ordinary point; else of which test it is the zero
+    count: Int[Array, ""]
+    work: Int[Array, ""]  # orbits computed
+
+
+def names(rows: int, slots: int) -> list[tuple[str, int, int]]:
+    """What each test function is: its kind, its segment, its guard."""
+    out = [(kind, 0, 0) for kind in (*ENDS, *PASSED)]
+    out += [(kind, i, 0) for kind in CORNERS[:-1] for i in range(rows)]
+    return out + [(CORNERS[-1], i, j) for i in range(rows) for j in range(slots)]
+
+
+def values_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Array:
+    """The test functions; those of corners are positive as long as the orbit is one."""
+    rows = len(look.begin)
+    index = jnp.arange(rows, dtype=course.num.dtype)
+    real, after = index < course.num, jnp.where(index >= course.num - 1, 0, index + 1)
+    ends = jnp.asarray(course.ends)
+    event = real & (ends == EVENT)
+    uncut = (
+        real & (course.num > 1) & (ends != LEAST) & (ends[jnp.where(index == 0, course.num - 1, index - 1)] != LEAST)
+    )
+    one = jnp.ones_like(look.begin)
+    rates = jnp.where(event & (ends[after] != FREE), -look.rates, one)
+    margins = jnp.where(event & jnp.isfinite(look.margins), look.margins, one)
+    lengths = jnp.where(uncut, (look.end - look.begin) / curve.time, one)
+    guards = jnp.where(real[:, None] & jnp.isfinite(look.least), look.least, 1.0)
+    sign, size = look.branch
+    singular = sign * jnp.exp(jnp.clip(size - log, -300, 300))
+    rho = look.multipliers
+    counts = jnp.isfinite(rho) & ~(trivial(rho) & curve.autonomous)
+    flip = jnp.prod(jnp.where(counts, (1 + rho) / (1 + jnp.abs(rho)), 1)).real
+    first, second = jnp.triu_indices(len(rho), 1)
+    off = rho[first] * rho[second] - 1
+    pairs = jnp.prod(jnp.where(counts[first] & counts[second], off / (1 + jnp.abs(off)), 1)).real
+    share = look.u[-1]
+    head = jnp.stack([share, 1 - share, look.tangent[-1], singular, flip, pairs])
+    return jnp.concatenate([head, rates, margins, lengths, guards.ravel()])
+
+
+def place_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Place:
+    row = Row(look.parameter, look.period, look.begin[0], look.x[0], look.low, look.high, look.multipliers, look.stable)
+    return Place(look.u, look.tangent, look.branch[1], values_of(curve, look, course, log), row)
+
+
+def follow_lane(
+    curve: OrbitCurve, course: Course, u: Array, found: Bool[Array, ""], upwards: Array, max_step: Array, points: int
+) -> Lane:
+    """The branch from `u` on, to its end, to the first corner, or to so many points."""
+    border = jnp.zeros_like(u).at[-1].set(1)
+    look = step_on(curve, course, u, border, jnp.zeros_like(u[0]), u)
+    forward = jnp.where(look.tangent[-1] >= 0, 1, -1) * upwards
+    look = look._replace(
+        tangent=look.tangent * forward, branch=look.branch * jnp.stack([forward, jnp.ones_like(forward)])
+    )
+    at = place_of(curve, look, course, look.branch[1])
+    ends = jnp.arange(len(at.values)) < len(ENDS)
+    ends = ends | (jnp.arange(len(at.values)) >= len(ENDS) + len(PASSED))
+    zero, none = jnp.zeros_like(u[0]), jnp.zeros((), jnp.int32)
+    rows = jax.tree.map(lambda x: jnp.zeros((points, *jnp.shape(x)), jnp.result_type(x)), at.row)
+    lane = Lane(
+        at=at, far=at, length=jnp.full_like(zero, FIRST),
+        doing=jnp.where(found & look.good, STEPPING, NO_ORBIT).astype(jnp.int32),
+        wanted=jnp.zeros_like(ends), target=none, near=jnp.zeros(2, u.dtype), off=jnp.zeros(2, u.dtype), tries=none,
+        end=jnp.full_like(zero, jnp.inf), arc=zero, rows=rows, arcs=jnp.zeros(points, u.dtype),
+        kinds=jnp.full(points, -1, jnp.int32), count=none, work=none,
+    )  # fmt: skip
+    lane = _written(lane, at.row, zero, -1, lane.doing == STEPPING)
+
+    def going(lane: Lane) -> Array:
+        return (lane.doing <= LOCATING) & (lane.count < points) & (lane.work < 4 * points)
+
+    def step(lane: Lane) -> Lane:
+        return jax.tree.map(
+            lambda new, old: jnp.where(going(lane), new, old), _moved(curve, course, lane, ends, max_step), lane
+        )
+
+    return lax.while_loop(going, step, lane)
+
+
+def _written(lane: Lane, row: Row, arc: Scalar, kind: Any, when: Bool[Array, ""]) -> Lane:
+    index = jnp.where(when, lane.count, len(lane.arcs))  # past the end it is dropped
+
+    def put(buffer: Array, value: Any) -> Array:
+        return buffer.at[index].set(value, mode="drop")
+
+    return lane._replace(
+        rows=jax.tree.map(put, lane.rows, row),
+        arcs=put(lane.arcs, arc),
+        kinds=put(lane.kinds, kind),
+        count=lane.count + when.astype(jnp.int32),
+    )
+
+
+def _moved(curve: OrbitCurve, course: Course, lane: Lane, ends: Array, max_step: Array) -> Lane:
+    """One more orbit: the next point, or one nearer to a zero."""
+    at, locating = lane.at, lane.doing == LOCATING
+    chord = (lane.far.u - at.u) / lane.length
+    s = jnp.where(locating, _between(lane), lane.length)
+    look = step_on(curve, course, at.u, at.tangent, s, at.u + s * jnp.where(locating, chord, at.tangent))
+    here = place_of(curve, look, course, at.log)
+    lane = lane._replace(work=lane.work + 1)
+    return jax.tree.map(
+        lambda a, b: jnp.where(locating, a, b),
+        _located(lane, here, look.good, s, ends, max_step),
+        _stepped(lane, here, look.good, ends, max_step),
+    )
+
+
+def _between(lane: Lane) -> Scalar:
+    """Where the secant of the bracket vanishes, or its middle (the second half of tries)."""
+    (a, b), (fa, fb) = lane.near, lane.off
+    s = (a * fb - b * fa) / jnp.where(fb == fa, 1, fb - fa)
+    inside = (s > a) & (s < b) & (lane.tries < TRIES // 2)
+    return jnp.where(inside, s, (a + b) / 2)
+
+
+def _length(lane: Lane, here: Place, max_step: Array) -> Scalar:
+    turn = jnp.arccos(jnp.clip(lane.at.tangent @ here.tangent, -1, 1))
+    speed = jnp.max(jnp.abs(here.tangent) / jnp.maximum(1, jnp.abs(here.u)))
+    return jnp.minimum(max_step / speed, lane.length * jnp.clip(TURN / jnp.maximum(turn, 1e-9), 0.5, 2))
+
+
+def _stepped(lane: Lane, here: Place, good: Array, ends: Array, max_step: Array) -> Lane:
+    turn = jnp.arccos(jnp.clip(lane.at.tangent @ here.tangent, -1, 1))
+    good = good & (turn <= TURNED) & jnp.all(jnp.isfinite(here.values))
+    before, after = lane.at.values, here.values
+    changed = jnp.where(ends, (before > 0) & (after <= 0), before * after < 0)
+    passes = good & ~jnp.any(changed)
+    shorter = lane.length / 2
+    lost = ~good & (shorter < SHORTEST)
+    on = lane._replace(
+        at=jax.tree.map(lambda new, old: jnp.where(passes, new, old), here, lane.at),
+        far=here,
+        length=jnp.where(passes, _length(lane, here, max_step), jnp.where(good, lane.length, shorter)),
+        doing=jnp.where(lost, LOST, jnp.where(good & ~passes, LOCATING, STEPPING)).astype(jnp.int32),
+        wanted=changed & good,
+        arc=lane.arc + jnp.where(passes, lane.length, 0),
+        end=jnp.full_like(lane.end, jnp.inf),
+    )
+    return _aimed(_written(on, here.row, on.arc, -1, passes))
+
+
+def _aimed(lane: Lane) -> Lane:
+    """At the next zero to be located."""
+    target = jnp.argmax(lane.wanted).astype(jnp.int32)
+    return lane._replace(
+        target=target,
+        near=jnp.stack([jnp.zeros_like(lane.length), lane.length]),
+        off=jnp.stack([lane.at.values[target], lane.far.values[target]]),
+        tries=jnp.zeros_like(lane.tries),
+    )
+
+
+def _located(lane: Lane, here: Place, good: Array, s: Scalar, ends: Array, max_step: Array) -> Lane:
+    """The bracket by the Illinois method; or, once it is closed, on to the next zero, or to the next step."""
+    value = here.values[lane.target]
+    (a, b), (fa, fb) = lane.near, lane.off
+    left = value * fa > 0  # the zero is on the other side
+    same = jnp.where(left, a, b) != jnp.where(left, 0, lane.length)  # that end has moved before
+    near = jnp.where(left, jnp.stack([s, b]), jnp.stack([a, s]))
+    off = jnp.where(
+        left, jnp.stack([value, jnp.where(same, fb / 2, fb)]), jnp.stack([jnp.where(same, fa / 2, fa), value])
+    )
+    tries = lane.tries + 1
+    # Beside a singular point there is no orbit to be had: what is known by then is all.
+    closed = ~good | (value == 0) | (near[1] - near[0] < 1e-14) | (jnp.abs(s - jnp.where(left, a, b)) < 1e-13)
+    closed = closed | (tries >= TRIES)
+    done = lane._replace(near=near, off=off, tries=tries)
+    ending = closed & ends[lane.target]
+    end = jnp.where(ending, jnp.minimum(lane.end, s), lane.end)
+    done = _written(done, here.row, lane.arc + s, lane.target, closed & good)
+    wanted = lane.wanted & ~(closed & (jnp.arange(len(ends)) == lane.target))
+    over = closed & ~jnp.any(wanted)
+    ended = over & jnp.isfinite(end)
+    passes = over & ~ended
+    after = done._replace(
+        at=jax.tree.map(lambda new, old: jnp.where(passes, new, old), lane.far, lane.at),
+        length=jnp.where(passes, _length(lane, lane.far, max_step), lane.length),
+        doing=jnp.where(ended, ENDED, jnp.where(passes, STEPPING, LOCATING)).astype(jnp.int32),
+        wanted=wanted,
+        end=end,
+        arc=lane.arc + jnp.where(passes, lane.length, 0),
+    )
+    aimed = _aimed(after)
+    after = jax.tree.map(lambda a, b: jnp.where(closed & ~over, a, b), aimed, after)
+    return _written(after, lane.far.row, after.arc, -1, passes)
