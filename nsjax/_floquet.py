@@ -38,7 +38,7 @@ def _triangular(factors: Float[Array, "factors n n"]) -> Float[Array, "n n"]:
     """
 
     def turn(q: Array, a: Array) -> tuple[Array, tuple[Array, Array]]:
-        after, r = jnp.linalg.qr(a @ q)
+        after, r = _qr(a @ q)
         return after, (q, r)
 
     frozen = lax.stop_gradient(factors)
@@ -52,6 +52,23 @@ def _triangular(factors: Float[Array, "factors n n"]) -> Float[Array, "n n"]:
     eps = float(jnp.finfo(factors.dtype).eps)
     around = jnp.where(jnp.tril(jnp.abs(around) <= 1e3 * eps, -1), 0, around)
     return around @ product(rs)
+
+
+def _qr(a: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+    """The QR factorization, for up to three rows by Givens rotations: LAPACK is called lane by lane."""
+    n = a.shape[-1]
+    if n > 3:
+        return jnp.linalg.qr(a)
+    r, q = [a[i] for i in range(n)], [x for x in jnp.eye(n, dtype=a.dtype)]
+    for j in range(n - 1):
+        for i in range(n - 1, j, -1):
+            x, y = r[i - 1][j], r[i][j]
+            h = jnp.hypot(x, y)
+            c, s = jnp.where(h > 0, x / jnp.where(h > 0, h, 1), 1), jnp.where(h > 0, y / jnp.where(h > 0, h, 1), 0)
+            for rows in (r, q):
+                rows[i - 1], rows[i] = c * rows[i - 1] + s * rows[i], c * rows[i] - s * rows[i - 1]
+            r[i] = r[i].at[j].set(0)
+    return jnp.stack(q).T, jnp.stack(r)
 
 
 def eigenvalues(matrix: Float[Array, "n n"]) -> Complex[Array, " n"]:

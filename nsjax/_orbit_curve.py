@@ -153,7 +153,9 @@ class OrbitCurve(eqx.Module):
         return State(tuple(mode), parts, tuple(jnp.zeros((), jnp.int32) for _ in model.switches))
 
     def guards(self, model: Model, t: Scalar, x: Array, state: State) -> Float[Array, "slots parts"]:
-        return model.stacked(model.guards(t, self.unravel(x), state), -jnp.inf)
+        wanted = tuple(self.slides or not slot.holding for slot in model.slots)
+        rows = model.guards(t, self.unravel(x), state, wanted)
+        return model.stacked([row or [jnp.ones_like(t)] for row in rows], -jnp.inf)
 
     def guard(self, model: Model, t: Scalar, x: Array, state: State, slot: Array, entry: Array) -> Scalar:
         if not model.slots:
@@ -330,7 +332,8 @@ class OrbitCurve(eqx.Module):
         # A node beside a zero is rounding divided by little.
         deflated = jnp.where(ok & (below > 1e-9), values / jnp.where(ok, below, 1), jnp.inf)
         index = jnp.argmin(deflated, axis=1)
-        return jnp.min(deflated, axis=1), jnp.max(values, axis=1), index
+        least = jnp.minimum(jnp.min(deflated, axis=1), _dip(theta, deflated))
+        return least, jnp.max(values, axis=1), index
 
     def zeros_at_begin(self, model: Model, course: Course) -> Array:
         """How many zeros each guard has at the beginning of each segment: that of the surface just left."""
@@ -410,6 +413,17 @@ def guard_sizes(curve: OrbitCurve, start: Start) -> np.ndarray:
     seen += [sizes(start.begin[0], start.x[0], mode, start.course.part[0]) for mode in every]
     found = np.max(np.abs(np.asarray(seen)), axis=0)
     return np.where(np.isfinite(found) & (found > 0), found, 1.0)
+
+
+def _dip(theta: Array, v: Float[Array, "rows nodes slots"]) -> Float[Array, "rows slots"]:
+    """The least value between nodes, by the parabola about every node."""
+    near, far = (theta[1:-1] - theta[:-2])[:, None], (theta[2:] - theta[1:-1])[:, None]
+    mid = v[:, 1:-1]
+    a, b = (mid - v[:, :-2]) / near, (v[:, 2:] - mid) / far
+    slope, bend = (a * far + b * near) / (near + far), (b - a) / (near + far)
+    low = mid - slope**2 / jnp.where(bend > 0, 4 * bend, jnp.inf)
+    inside = (bend > 0) & (-slope < 2 * bend * far) & (slope < 2 * bend * near)
+    return jnp.min(jnp.where(inside, low, jnp.inf), axis=1)
 
 
 def _largest(theta: Array, xs: Array, inside: Array) -> Array:

@@ -17,7 +17,7 @@ FIRST, SHORTEST = 1e-3, 1e-9  # steps, in units of the curve
 TURN, TURNED = 0.15, 0.5  # the angles between tangents that are aimed at, and allowed
 TRIES = 40  # to locate one zero
 # What a lane is doing, and how it ended.
-STEPPING, LOCATING, ENDED, LOST, NO_ORBIT = range(5)
+STARTING, STEPPING, LOCATING, ENDED, LOST, NO_ORBIT = range(6)
 PASSED = ("fold", "branch point", "flip", "Neimark-Sacker")  # zeros through which the branch goes on
 ENDS = ("low", "high")
 CORNERS = ("tangency", "margin", "duration", "grazing")  # of each segment, the last of each guard too
@@ -109,33 +109,26 @@ def follow_lane(
     curve: OrbitCurve, course: Course, u: Array, found: Bool[Array, ""], upwards: Array, max_step: Array, points: int
 ) -> Lane:
     """The branch from `u` on, to its end, to the first corner, or to so many points."""
-    border = jnp.zeros_like(u).at[-1].set(1)
-    look = step_on(curve, course, u, border, jnp.zeros_like(u[0]), u)
-    forward = jnp.where(look.tangent[-1] >= 0, 1, -1) * upwards
-    look = look._replace(
-        tangent=look.tangent * forward, branch=look.branch * jnp.stack([forward, jnp.ones_like(forward)])
-    )
-    at = place_of(curve, look, course, look.branch[1])
-    ends = jnp.arange(len(at.values)) < len(ENDS)
-    ends = ends | (jnp.arange(len(at.values)) >= len(ENDS) + len(PASSED))
     zero, none = jnp.zeros_like(u[0]), jnp.zeros((), jnp.int32)
-    rows = jax.tree.map(lambda x: jnp.zeros((points, *jnp.shape(x)), jnp.result_type(x)), at.row)
+    border = jnp.zeros_like(u).at[-1].set(1)
+    blank = jax.eval_shape(lambda: place_of(curve, step_on(curve, course, u, border, zero, u), course, zero))
+    at = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)._replace(u=u, tangent=border)
+    rows = jax.tree.map(lambda x: jnp.zeros((points, *x.shape), x.dtype), blank.row)
+    index = jnp.arange(len(at.values))
+    ends = (index < len(ENDS)) | (index >= len(ENDS) + len(PASSED))
     lane = Lane(
-        at=at, far=at, length=jnp.full_like(zero, FIRST),
-        doing=jnp.where(found & look.good, STEPPING, NO_ORBIT).astype(jnp.int32),
+        at=at, far=at, length=zero, doing=jnp.where(found, STARTING, NO_ORBIT).astype(jnp.int32),
         wanted=jnp.zeros_like(ends), target=none, near=jnp.zeros(2, u.dtype), off=jnp.zeros(2, u.dtype), tries=none,
         end=jnp.full_like(zero, jnp.inf), arc=zero, rows=rows, arcs=jnp.zeros(points, u.dtype),
         kinds=jnp.full(points, -1, jnp.int32), count=none, work=none,
     )  # fmt: skip
-    lane = _written(lane, at.row, zero, -1, lane.doing == STEPPING)
 
     def going(lane: Lane) -> Array:
         return (lane.doing <= LOCATING) & (lane.count < points) & (lane.work < 4 * points)
 
     def step(lane: Lane) -> Lane:
-        return jax.tree.map(
-            lambda new, old: jnp.where(going(lane), new, old), _moved(curve, course, lane, ends, max_step), lane
-        )
+        moved = _moved(curve, course, lane, ends, upwards, max_step)
+        return jax.tree.map(lambda new, old: jnp.where(going(lane), new, old), moved, lane)
 
     return lax.while_loop(going, step, lane)
 
@@ -154,19 +147,29 @@ def _written(lane: Lane, row: Row, arc: Scalar, kind: Any, when: Bool[Array, ""]
     )
 
 
-def _moved(curve: OrbitCurve, course: Course, lane: Lane, ends: Array, max_step: Array) -> Lane:
+def _moved(curve: OrbitCurve, course: Course, lane: Lane, ends: Array, upwards: Array, max_step: Array) -> Lane:
     """One more orbit: the next point, or one nearer to a zero."""
-    at, locating = lane.at, lane.doing == LOCATING
-    chord = (lane.far.u - at.u) / lane.length
+    at, locating, starting = lane.at, lane.doing == LOCATING, lane.doing == STARTING
+    chord = (lane.far.u - at.u) / jnp.where(locating, lane.length, 1)
     s = jnp.where(locating, _between(lane), lane.length)
     look = step_on(curve, course, at.u, at.tangent, s, at.u + s * jnp.where(locating, chord, at.tangent))
-    here = place_of(curve, look, course, at.log)
+    turn = jnp.where(starting & (look.tangent[-1] * upwards < 0), -1, 1).astype(s.dtype)
+    # The sign of a determinant of which the tangent is a row.
+    look = look._replace(tangent=turn * look.tangent, branch=look.branch * jnp.stack([turn, jnp.ones_like(turn)]))
+    here = place_of(curve, look, course, jnp.where(starting, look.branch[1], at.log))
     lane = lane._replace(work=lane.work + 1)
-    return jax.tree.map(
-        lambda a, b: jnp.where(locating, a, b),
+    first = lane._replace(
+        at=here,
+        far=here,
+        length=jnp.full_like(s, FIRST),
+        doing=jnp.where(look.good, STEPPING, NO_ORBIT).astype(jnp.int32),
+    )
+    options = (
+        _written(first, here.row, s, -1, look.good),
         _located(lane, here, look.good, s, ends, max_step),
         _stepped(lane, here, look.good, ends, max_step),
     )
+    return jax.tree.map(lambda a, b, c: jnp.where(starting, a, jnp.where(locating, b, c)), *options)
 
 
 def _between(lane: Lane) -> Scalar:
