@@ -275,7 +275,7 @@ class _Tree:
             if zero.test.kind == "guard":
                 zero = grazing_at(tracer, zero) or zero
                 strand.spots[-1] = (zero.spot, order)
-            node = next((n for n in self.nodes if n.is_at(zero.spot, curve)), None)
+            node = next((n for n in self.nodes if n.is_at(zero, curve)), None)
             if node is None:
                 laps = max(1, self.max_order // order)
                 node = node_at(tracer, self.name, zero, laps)
@@ -303,7 +303,7 @@ class _Tree:
         """A bifurcation through which the branch goes on as it is."""
         curve, spot = tracer.curve, zero.spot
         if zero.test.kind == "flip":
-            node = next((n for n in self.nodes if n.is_at(spot, curve)), None)
+            node = next((n for n in self.nodes if n.is_at(zero, curve)), None)
             if node is None:
                 node = node_at(tracer, self.name, zero, 2)
                 if node is None:
@@ -336,7 +336,10 @@ class _Tree:
             here = None if step is None else tracer.between(half.spot, step, last.parameter)
             if here is not None and alike(here, last, curve, SAME):
                 return half
-        return None
+        # Through a corner there is one curve in each course.
+        key = arc.spots[-1].course.key()
+        same = [h for h in node.halves if int(h.curve.order) == order and h.spot.course.key() == key]
+        return same[0] if len(same) == 1 and node.bifurcation.discontinuous else None
 
     def result(self) -> OrbitBranch:
         made = [

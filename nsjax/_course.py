@@ -52,6 +52,12 @@ class Course(NamedTuple):
         return Course(mode, part, ends, slot, entry, np.asarray(len(rows), np.int32))
 
 
+def same_course(a: Course, b: Course) -> bool:
+    """Whether they are equal row by row."""
+    n = int(a.num)
+    return n == int(b.num) and all(np.array_equal(x[:n], y[:n]) for x, y in zip(a[:5], b[:5]))
+
+
 class Start(NamedTuple):
     """An orbit with the course that it takes: times and states at the beginnings and ends of its segments."""
 

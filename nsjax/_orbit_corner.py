@@ -1,5 +1,6 @@
 """Corners of branches of periodic orbits: the orbit touches the tip of a surface, grazes one, or a segment vanishes."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import toms748
 
-from ._course import Course, EVENT, FREE, LEAST, Start, start_from, TIME
+from ._course import capacity_for, Course, EVENT, FREE, LEAST, same_course, Start, start_from, TIME
 from ._crossings import eigenvalue_crossings
 from ._cycles import corner_kind, CornerMap, Cycle, Cycles, find_cycles
 from ._orbit_bifurcation import named, OrbitBifurcation
@@ -22,16 +23,19 @@ from ._orbit_node import (
     Node,
     set_out,
     side_of,
+    together,
     told,
     tracer_for,
     with_order,
 )
-from ._orbit_trace import CORNERS, OrbitTracer, Spot, Test, turned, Zero
+from ._orbit_trace import Arc, CORNERS, OrbitTracer, Spot, Test, turned, Zero
 from ._return_map import Base, follow, frame, return_map, ReturnMap, Touch, touches_of
 from ._system import impact
 
 
-DEPARTURES = (1e-4, 1e-5, 1e-3)  # at which a half-branch is entered: changes of the parameter, in its interval
+DEPARTURES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-7)  # at which a half-branch is entered: of the parameter, in its interval
+BACK = 40  # points from there to the corner
+NEIGHBOUR = 1e-5  # at which the corner is known again
 KNOWN = 1e-6  # the digits of a normal form
 
 
@@ -54,26 +58,61 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
     if kind == "guard":
         return _end(tracer, name, zero)
     # Several places may be touched at once, by symmetry, and the event happen at some of them only.
-    together = ("duration", "margin") if kind in ("duration", "margin") else (kind,)
-    kinds = {t.row: t.kind for t in (*zero.others, zero.test) if t.kind in together}
+    alike = ("duration", "margin") if kind in ("duration", "margin") else (kind,)
+    kinds = {t.row: t.kind for t in (*zero.others, zero.test) if t.kind in alike}
     rows = list(kinds)
     bounces = kind == "rate" and all(_is_impact(curve, spot, row) for row in rows)
     if kind == "rate" and not bounces:
         node = repelled_at(tracer, name, spot, rows)
         return node or _end(tracer, name, zero)
     touches = touches_of(spot, rows)
-    if cover_of(spot, curve) > 1:  # the corner is that of the orbit once
-        return None
+    times = cover_of(spot, curve, KNOWN)
+    if times > 1:
+        once = _once(tracer, zero, rows, times)
+        return None if once is None else corner_at(once[0], name, once[1], times * most)
     found_map = return_map(curve, spot, touches)
     if found_map is None or found_map[0].jumps:
         return _end(tracer, name, zero)
     mapped, points = found_map
     arrived = tuple(int(kinds[t.row] == "duration" or bounces) for t in touches)
     cycles = cycles_of(mapped, most) if mapped.corner.e.any() else _through(mapped.corner, zero.side, arrived)
-    halves = [half for cycle in cycles.cycles if (half := half_of(tracer, spot, mapped, points, cycle)) is not None]
+    halves = [half for cycle in cycles.cycles if (half := half_of(tracer, spot, points, cycle)) is not None]
     _pair(halves)
     made = described(name, curve, spot, mapped, cycles, halves, touches, arrived)
     return Node(spot, int(curve.order), halves, made)
+
+
+def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple[OrbitTracer, Zero] | None:
+    """The corner of an orbit that is seen several times, seen once: the lap that ends with the first of the places."""
+    curve, look, course = tracer.curve, zero.spot.look, zero.spot.course
+    n, whole, last = int(course.num), float(look.period), zero.test.row
+    lap, slack = whole / times, KNOWN * whole
+    t = look.end[last] - lap
+    lap_rows, begins, ends = [], [], []
+    for back in range(n):
+        i = (last - back) % n
+        shift = whole if i > last else 0.0
+        lap_rows.insert(0, i)
+        begins.insert(0, max(t, look.begin[i] - shift))
+        ends.insert(0, look.end[i] - shift)
+        if begins[0] < t + slack:
+            break
+    begins[0] = t
+    x = look.x[lap_rows].copy()
+    x[0] = look.x[(last + 1) % n]  # what ends here begins anew
+    short = course.take(lap_rows, capacity_for(len(lap_rows)))
+    once = tracer_for(tracer, with_order(curve, int(curve.order) // times))
+    u = np.asarray(once.curve.pack(Start(short, np.array(begins), np.array(ends), x), zero.spot.parameter))
+    border = np.zeros_like(u)
+    border[-1] = 1.0
+    if zero.test.kind == "duration":  # it stays zero: the parameter may be least there
+        at = (len(lap_rows) - 1) * (len(curve.sizes) + 2)
+        border[[-1, at, at + 1]] = 0.0, -1.0, 1.0
+    spot = once.corrected(short, u, border)
+    if spot is None or not together(spot, zero.spot, curve, NEIGHBOUR):
+        return None
+    tests = [t._replace(row=lap_rows.index(t.row)) for t in (zero.test, *zero.others) if t.row in lap_rows]
+    return once, zero._replace(spot=spot, test=tests[0], others=tuple(tests[1:]))
 
 
 def _is_impact(curve: OrbitCurve, spot: Spot, row: int) -> bool:
@@ -208,24 +247,54 @@ def _reduced(curve: OrbitCurve, monodromy: np.ndarray) -> np.ndarray:
     return frame @ monodromy @ frame.T
 
 
-def half_of(tracer: OrbitTracer, spot: Spot, mapped: ReturnMap, points: list[Base], cycle: Cycle) -> Half | None:
+def half_of(tracer: OrbitTracer, spot: Spot, points: list[Base], cycle: Cycle) -> Half | None:
     """The orbit that a cycle of the normal form foretells, a little way off: piece by piece by the flow, which finds
     its itinerary, and then corrected."""
-    curve = tracer.curve
-    own = tracer_for(tracer, with_order(curve, int(curve.order) * cycle.laps))
+    own = tracer_for(tracer, with_order(tracer.curve, int(tracer.curve.order) * cycle.laps))
     for departure in DEPARTURES:
         distance = min(departure, 10 * departure / max(1e-12, float(np.abs(cycle.points).max())))
-        start = _foretold(curve, spot, points, cycle, distance)
-        if start is None:
-            continue
-        value = spot.parameter + cycle.side * distance * float(curve.width)
-        start = start.filled()
-        found = own.corrected(start.course, np.asarray(own.curve.pack(start, value)))
+        found = _entered(own, spot, points, cycle, distance)
         if found is None or not admissible(own.curve, found):
             continue
-        if float(np.sign(found.look.tangent[-1])) != cycle.side:
-            found = turned(found)
-        return Half(found, own.curve, cycle.laps, cycle.side, cycle)
+        found = _beside(own, spot, found if float(found.look.tangent[-1]) * cycle.side >= 0 else turned(found))
+        if found is not None:
+            return Half(found, own.curve, cycle.laps, cycle.side, cycle)
+    return None
+
+
+def _entered(tracer: OrbitTracer, spot: Spot, points: list[Base], cycle: Cycle, distance: float) -> Spot | None:
+    """Corrected across the way on which the foretold orbits lie: at one parameter there may be none, where the branch
+    turns round next to the corner."""
+    curve = tracer.curve
+    near, far = (_foretold(curve, spot, points, cycle, share * distance) for share in (0.5, 1.0))
+    if near is None or far is None or not same_course(near.course, far.course):
+        return None
+    values = [spot.parameter + cycle.side * share * distance * float(curve.width) for share in (0.5, 1.0)]
+    before, guess = (np.asarray(curve.pack(s.filled(), v)) for s, v in zip((near, far), values))
+    return tracer.corrected(far.filled().course, guess, (guess - before) / np.linalg.norm(guess - before))
+
+
+def _beside(tracer: OrbitTracer, at: Spot, found: Spot) -> Spot | None:
+    """The orbit between a corner and whatever else there is on the way to it from an orbit, whose tangent should point
+    away from the corner; None if the way does not come there."""
+    short = dataclasses.replace(tracer, max_points=BACK)
+    for back in (turned(found), found):
+        arc = Arc([back])
+        for _ in short.arc(arc):
+            pass
+        end = arc.end
+        if end is not None and end.test.kind == "guard":
+            end = grazing_at(tracer, end)
+        if end is None or not together(end.spot, at, tracer.curve, NEIGHBOUR):
+            continue
+        if not arc.passed:
+            return turned(back)
+        last, final = arc.spots[-2:]
+        if arc.passed[-1][0] < len(arc.spots) - 2:
+            return turned(last)
+        way = final.look.u - last.look.u
+        between = tracer.corrected(found.course, last.look.u + way / 2, way / np.linalg.norm(way))
+        return None if between is None else turned(between)
     return None
 
 

@@ -21,7 +21,7 @@ from ._filippov import Model, State
 from ._floquet import floquet, structural_zeros
 from ._implicit import find_root
 from ._parameter import Path
-from ._segment_flow import ALWAYS, NEVER, SegmentFlow, THETA, with_parameter
+from ._segment_flow import ALWAYS, FREE_MODES, NODES, SegmentFlow, THETA, with_parameter
 from ._system import impact, relay
 from ._types import Scalar, Y
 
@@ -40,8 +40,10 @@ class Look(NamedTuple):
     - `rates`: of the guard that ends each segment, there: negative unless it comes to its surface tangentially.
     - `ends`: value of that guard there.
     - `margins`: |λ| - b at events that cross a surface which could hold.
-    - `least`, `where`, `most`, `spots`: of each segment and guard the least value, without the zeros that it has at the
-        ends; at which share of the segment; the largest value; and the state where it is least.
+    - `least`, `where`, `most`, `spots`: of each segment and guard the least value at the nodes, without the zeros that
+        it has at the ends; at which share of the segment; the largest value; and the state where it is least.
+    - `between`: the least value by parabolas between nodes. `rise`: by how much it is larger at a node beside that
+        one; `orders`: of its zeros at both ends.
     - `low`, `high`: the least and the largest value of each component of the state; `mean`, `square`: its mean and that
         of its square over time.
     - `ts`, `xs`: times and states along each segment.
@@ -69,6 +71,9 @@ class Look(NamedTuple):
     where: Array
     most: Array
     spots: Array
+    between: Array
+    rise: Array
+    orders: Array
     low: Array
     high: Array
     mean: Array
@@ -106,15 +111,12 @@ class OrbitCurve(eqx.Module):
         held = {k: int(k in self.model.contacts) for k in self.model.holdable}
         modes = np.asarray(course.mode)[: int(course.num)]
         slides = any(bool(np.any(modes[:, k] == value)) for k, value in held.items())
-        return self.sliding(slides)
-
-    def sliding(self, slides: bool) -> "OrbitCurve":
-        exact = NEVER if slides and self.exact != ALWAYS else self.exact
-        return dataclasses.replace(self, exact=exact, slides=slides)
+        return dataclasses.replace(self, slides=slides)
 
     @property
     def flow(self) -> SegmentFlow:
-        return SegmentFlow(self.model, self.path, self.like, self.how, self.exact != NEVER, self.slides)
+        exact = self.exact == ALWAYS or (self.exact == FREE_MODES and not self.slides)
+        return SegmentFlow(self.model, self.path, self.like, self.how, exact, self.slides)
 
     @property
     def autonomous(self) -> bool:
@@ -293,24 +295,25 @@ class OrbitCurve(eqx.Module):
         period = end[course.num - 1] - begin[0]
         if not self.autonomous:
             period = jnp.asarray(model.system.period, u.dtype) * self.order.astype(u.dtype)
-        least, most, index = self._least(model, theta, ts, xs, course)
+        least, between, most, index, rise, orders = self._least(model, theta, ts, xs, course)
         where, spots = theta[index], jnp.take_along_axis(xs, index[..., None], axis=1)
         rates, values, margins = self._at_ends(model, end, last, course)
         return Look(
             u, tangent, good & jnp.all(jnp.isfinite(tangent)), value, period, begin, end, x, last, factors, *found,
-            rates, values, margins, least, where, most, spots, low, high, mean, square, ts, xs, branch,
-            jnp.max(jnp.abs(f)),
+            rates, values, margins, least, where, most, spots, between, rise, orders, low, high, mean, square, ts, xs,
+            branch, jnp.max(jnp.abs(f)),
         )  # fmt: skip
 
     def _least(
         self, model: Model, theta: Array, ts: Array, xs: Array, course: Course
-    ) -> tuple[Float[Array, "rows slots"], Float[Array, "rows slots"], Int[Array, "rows slots"]]:
-        """Of every guard in every segment the least value, divided by the zeros that it must have at the ends; the
-        largest; and at which node it is least."""
+    ) -> tuple[Array, Array, Array, Int[Array, "rows slots"], Array, Array]:
+        """Of every guard in every segment the least value at the nodes, divided by the zeros that it must have at the
+        ends, and that between them; the largest; at which node it is least; by how much it rises to the nodes beside
+        that; and the zeros' orders."""
         rows = len(ts)
         if not model.slots:
             none = jnp.ones((rows, 0), ts.dtype)
-            return none, none, jnp.zeros((rows, 0), jnp.int32)
+            return none, none, none, jnp.zeros((rows, 0), jnp.int32), none, jnp.ones((2, rows, 0), ts.dtype)
         mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
 
         def row(ts: Array, xs: Array, m: Array, p: Array) -> Array:
@@ -326,14 +329,14 @@ class OrbitCurve(eqx.Module):
         last = jnp.where(
             (course.ends == EVENT)[:, None] & here, jnp.where(course.ends[after] == FREE, 2, 1)[:, None], 0
         )
-        below = theta[None, :, None] ** zeros[:, None, :]
-        below = below * (1 - theta[None, :, None]) ** last[:, None, :].astype(theta.dtype)
-        ok = below > 0
-        # A node beside a zero is rounding divided by little.
-        deflated = jnp.where(ok & (below > 1e-9), values / jnp.where(ok, below, 1), jnp.inf)
+        orders = jnp.stack([zeros, last.astype(theta.dtype)])
+        deflated = _deflated(values, theta[None, :, None], orders[:, :, None])
         index = jnp.argmin(deflated, axis=1)
-        least = jnp.minimum(jnp.min(deflated, axis=1), _dip(theta, deflated))
-        return least, jnp.max(values, axis=1), index
+        least = jnp.min(deflated, axis=1)
+        beside = jnp.clip(jnp.stack([index - 1, index + 1], axis=1), 0, len(theta) - 1)
+        rise = jnp.max(jnp.take_along_axis(deflated, beside, axis=1), axis=1) - least
+        between = jnp.minimum(least, _dip(theta, deflated))
+        return least, between, jnp.max(values, axis=1), index, rise, orders
 
     def zeros_at_begin(self, model: Model, course: Course) -> Array:
         """How many zeros each guard has at the beginning of each segment: that of the surface just left."""
@@ -426,6 +429,13 @@ def _dip(theta: Array, v: Float[Array, "rows nodes slots"]) -> Float[Array, "row
     return jnp.min(jnp.where(inside, low, jnp.inf), axis=1)
 
 
+def _deflated(values: Array, theta: Array, orders: Array) -> Array:
+    """Divided by zeros at both ends, of these orders."""
+    below = theta ** orders[0] * (1 - theta) ** orders[1]
+    # A node beside a zero is rounding divided by little.
+    return jnp.where(below > 1e-9, values / jnp.where(below > 0, below, 1), jnp.inf)
+
+
 def _largest(theta: Array, xs: Array, inside: Array) -> Array:
     """The largest value of each component, by the parabola through the largest sample and its neighbours."""
     here = jnp.where(inside[..., None], xs, -jnp.inf)
@@ -486,6 +496,29 @@ def state_at(curve: OrbitCurve, value: Array, a: Scalar, t: Scalar, x: Array, mo
 def linearised(curve: OrbitCurve, course: Course, u: Array) -> Array:
     """The derivatives of the equations, row by row of size one."""
     return _linearised(curve.on(course), course, u)
+
+
+@eqx.filter_jit
+def least_between(
+    curve: OrbitCurve, value: Scalar, ab: Array, shares: Array, x: Array, mode: Array, part: Array, slot: Array,
+    orders: Array,
+) -> Scalar:  # fmt: skip
+    """The least value of a guard between two shares of a segment, from the state at the first one; without the zeros at
+    its ends. Where several components meet, at a tip, it has a kink there: each is interpolated for itself."""
+    model = with_parameter(curve.model, curve.path, value)
+    state = curve.state(mode, part)
+    theta = shares[0] + (shares[1] - shares[0]) * jnp.asarray(THETA, x.dtype)
+    begin, end = ab[0] + (ab[1] - ab[0]) * shares
+    ts, xs, _ = curve.flow.along(begin, end, x, value, state)
+    parts = jax.vmap(lambda t, x: curve.guards(model, t, x, state)[slot])(ts, xs)
+    i = jnp.argmin(_deflated(jnp.max(parts, axis=1), theta, orders))
+    window = jnp.clip(i - 2, 0, NODES - 4) + jnp.arange(5, dtype=i.dtype)
+    nodes, five = theta[window], jnp.where(jnp.isneginf(parts[window]), -1e300, parts[window])  # which is no component
+    fine = jnp.linspace(theta[jnp.maximum(i - 1, 0)], theta[jnp.minimum(i + 1, NODES)], NODES + 1)
+    apart = ~jnp.eye(5, dtype=bool)
+    shares_of = (fine[:, None, None] - nodes) / jnp.where(apart, nodes[:, None] - nodes, 1)
+    weights = jnp.prod(jnp.where(apart, shares_of, 1), axis=-1)  # of Lagrange's polynomials
+    return jnp.min(_deflated(jnp.max(weights @ five, axis=1), fine, orders))
 
 
 @eqx.filter_jit

@@ -86,7 +86,7 @@ def values_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Arr
     rates = jnp.where(event & (ends[after] != FREE), -look.rates, one)
     margins = jnp.where(event & jnp.isfinite(look.margins), look.margins, one)
     lengths = jnp.where(uncut, (look.end - look.begin) / curve.time, one)
-    guards = jnp.where(real[:, None] & jnp.isfinite(look.least), look.least, 1.0)
+    guards = jnp.where(real[:, None] & jnp.isfinite(look.between), look.between, 1.0)
     sign, size = look.branch
     singular = sign * jnp.exp(jnp.clip(size - log, -300, 300))
     rho = look.multipliers

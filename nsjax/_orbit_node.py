@@ -10,11 +10,12 @@ from ._course import capacity_for, Course, Start, TIME
 from ._cycles import Cycle
 from ._orbit_bifurcation import OrbitBifurcation, OrbitHalf
 from ._orbit_curve import advance, linearised, OrbitCurve, state_at
-from ._orbit_trace import alike, CORNERS, OrbitTracer, Spot, spot_of, tests, turned
+from ._orbit_trace import alike, CORNERS, midpoint, OrbitTracer, Spot, spot_of, tests, turned, Zero
 
 
-BRANCHING = (3e-3, 1e-3, 1e-2, 3e-4)  # lengths of the step by which a branch is entered along its direction
+BRANCHING = (3e-3, 1e-3, 1e-2, 3e-4, 1e-4, 1e-5)  # lengths of the step by which a branch is entered along its direction
 ALIKE = 1e-6  # two points that are nearer are one
+MOST_LAPS = 8  # in which an autonomous orbit may pass through the same points several times
 
 
 @dataclasses.dataclass
@@ -49,9 +50,15 @@ class Node:
     halves: list[Half]
     bifurcation: OrbitBifurcation
 
-    def is_at(self, spot: Spot, curve: OrbitCurve) -> bool:
-        near = abs(self.spot.parameter - spot.parameter) < ALIKE * float(curve.width)
-        return near and alike(self.spot, spot, curve, ALIKE)
+    def is_at(self, zero: Zero, curve: OrbitCurve) -> bool:
+        """Whether it is this zero of a test function: a smooth bifurcation may be right beside a corner."""
+        smooth = zero.test.kind in ("flip", "branch")
+        return smooth != self.bifurcation.discontinuous and together(self.spot, zero.spot, curve, ALIKE)
+
+
+def together(a: Spot, b: Spot, curve: OrbitCurve, tolerance: float) -> bool:
+    """Whether two are the same orbit at the same parameter."""
+    return abs(a.parameter - b.parameter) < tolerance * float(curve.width) and alike(a, b, curve, tolerance)
 
 
 def with_order(curve: OrbitCurve, order: int) -> OrbitCurve:
@@ -168,16 +175,21 @@ def branch_point_at(tracer: OrbitTracer, name: str, spot: Spot) -> Node | None:
     return Node(spot, int(curve.order), halves, made)
 
 
-def cover_of(spot: Spot, curve: OrbitCurve) -> int:
-    """2 if the orbit passes twice through the same points."""
-    look, n = spot.look, int(spot.course.num)
-    if not curve.autonomous and int(curve.order) % 2:
-        return 1
-    t = look.begin[0] + float(look.period) / 2
-    i = next((i for i in range(n) if look.begin[i] <= t <= look.end[i]), n - 1)
-    args = (look.parameter, look.begin[i], t, look.x[i], spot.course.mode[i], spot.course.part[i])
-    away = np.abs(np.asarray(state_at(curve, *args)) - look.x[0]) / np.asarray(curve.sizes)
-    return 2 if float(away.max()) < 1e-4 else 1
+def cover_of(spot: Spot, curve: OrbitCurve, tolerance: float = 1e-4) -> int:
+    """How many times the orbit passes through the same points."""
+    look, n, order = spot.look, int(spot.course.num), int(curve.order)
+    period = float(look.period)
+    t, x, _ = midpoint(curve, spot, spot.course.rows)
+
+    def away(times: int) -> float:
+        later = float(look.begin[0]) + (t - float(look.begin[0]) + period / times) % period
+        i = next((i for i in range(n) if look.begin[i] <= later <= look.end[i]), n - 1)
+        args = (look.parameter, look.begin[i], later, look.x[i], spot.course.mode[i], spot.course.part[i])
+        return float(np.max(np.abs(np.asarray(state_at(curve, *args)) - x) / np.asarray(curve.sizes)))
+
+    most = MOST_LAPS if curve.autonomous else order
+    several = [k for k in range(most, 1, -1) if curve.autonomous or order % k == 0]
+    return next((k for k in several if away(k) < tolerance), 1)
 
 
 def side_of(half: Spot, at: Spot, curve: OrbitCurve) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import toms748
 
 from ._course import Course, EVENT, FREE, LEAST
-from ._orbit_curve import advance, Look, OrbitCurve, state_at
+from ._orbit_curve import advance, least_between, Look, NODES, OrbitCurve, state_at, THETA
 
 
 FIRST, SHORTEST = 1e-3, 1e-9  # steps, in units of the curve
@@ -31,7 +31,8 @@ class Test(NamedTuple):
 
 
 BRANCH = Test("branch")
-SINGULAR = 1e-3  # its value, beside that a step before, at which a fold is that of a branch point
+SINGULAR = 1e-3  # its value, beside that a step before, at which another zero is that of a branch point
+ASIDE = 1e-2  # from a branch point, in steps: a fold that is nearer is the branch point's own
 
 
 @dataclasses.dataclass
@@ -55,10 +56,27 @@ class Spot:
 
 
 def spot_of(curve: OrbitCurve, look: Look, course: Course) -> Spot:
-    look = jax.device_get(look)
+    look = _exact(curve, jax.device_get(look), course)
     if FREE in course.ends[: int(course.num)]:
         return _infinitely_unstable(curve, look, course)
     return Spot(look, course, look.multipliers, bool(look.stable), look.monodromy)
+
+
+def _exact(curve: OrbitCurve, look: Look, course: Course) -> Look:
+    """With the least values of guards where those at the nodes leave open whether they are positive."""
+    n = int(course.num)
+    open_ones = (look.least[:n] < look.rise[:n]) & np.isfinite(look.rise[:n])
+    least = np.array(look.least)
+    for i, j in np.argwhere(open_ones):
+        node = int(np.argmin(np.abs(THETA - look.where[i, j])))
+        begin, end = look.begin[i], look.end[i]
+        if not 0 < node < NODES or not end > begin:
+            continue
+        ab, shares = np.array([begin, end]), THETA[[node - 1, node + 1]]
+        args = (look.xs[i, node - 1], course.mode[i], course.part[i], np.asarray(j), look.orders[:, i, j])
+        value = float(least_between(curve, look.parameter, ab, shares, *args))
+        least[i, j] = min(least[i, j], value) if np.isfinite(value) else least[i, j]
+    return look._replace(least=least)
 
 
 def _infinitely_unstable(curve: OrbitCurve, look: Look, course: Course) -> Spot:
@@ -249,8 +267,19 @@ class OrbitTracer:
                 return None
             found += [] if at is None else [at._replace(test=test)]
         # What turns round at a branch point that it crosses is no fold.
-        found = [z for z in found if z.test.kind != "fold" or abs(self.value(z.spot, BRANCH, scale)) > SINGULAR]
+        branching = [z.s for z in found if z.test == BRANCH]
+        found = [z for z in found if z.test.kind != "fold" or all(abs(z.s - s) > ASIDE * length for s in branching)]
         found.sort(key=lambda zero: zero.s)
+        final = next((z for z in found if z.test.kind not in PASSED), None)
+        if final is not None:
+            # What lies before the end of the course may have changed back beyond it.
+            there = tests(self.curve, final.spot, scale)
+            for test in (t for t in before if t.kind in PASSED and before[t] * there[t] < 0):
+                if any(z.test == test and z.s <= final.s for z in found):
+                    continue
+                zero = self.located(spot, final.spot, final.s, test, scale)
+                found += [] if zero is None else [zero]
+            found.sort(key=lambda zero: zero.s)
         out: list[Zero] = []
         for zero in found:
             final = zero.test.kind not in PASSED

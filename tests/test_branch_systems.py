@@ -1,0 +1,150 @@
+"""Branches of periodic orbits of systems that are not the thesis's, with answers that are known otherwise."""
+
+import branch_reference
+import diffrax as dfx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import Motion, pid
+from reference import mp
+from test_continue_orbit import orbit_of, same_multipliers, stability_agrees, the
+
+import nsjax
+from nsjax import continue_orbit
+
+
+class Bumper(nsjax.System):
+    """x'' + c x' + x = cos ωt before a visco-elastic support at x_c, whose damper makes multipliers jump at a touch."""
+
+    c: float = 0.1
+    k_f: float = 4.0
+    c_f: float = 1.0
+    x_c: float = 3.0
+    omega: float = 1.14
+
+    def vector_field(self, t, y, s):
+        force = self.wall(t, y)[1] * (1 + s.wall) / 2
+        return Motion(y.v, jnp.cos(self.omega * t) - self.c * y.v - y.x - force)
+
+    @nsjax.sgn
+    def wall(self, t, y):
+        return y.x - self.x_c, self.k_f * (y.x - self.x_c) + self.c_f * y.v
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+class BumperReference:
+    """The orbits with one contact, in 50 digits. The monodromy depends on the contact's duration alone, and so the
+    duration at a fold or flip is the root of one function."""
+
+    def __init__(self, omega, c_f=None, c=0.1, k_f=4.0):
+        self.omega, self.c, self.k_f = (mp.mpf(p) for p in (omega, c, k_f))
+        self.c_f = None if c_f is None else mp.mpf(c_f)
+        self.period = 2 * mp.pi / self.omega
+
+    def gain(self, c, k):
+        return 1 / mp.mpc(k - self.omega**2, c * self.omega)
+
+    def transition(self, t, c, k):
+        d = c / 2
+        w = mp.sqrt(k - d * d)
+        e, cos, sin = mp.exp(-d * t), mp.cos(w * t), mp.sin(w * t) / w
+        return mp.matrix([[e * (cos + d * sin), e * sin], [-e * k * sin, e * (cos - d * sin)]])
+
+    def flow(self, begin, y, end, stiff, x_c):
+        c, k = (self.c + self.c_f, 1 + self.k_f) if stiff else (self.c, mp.mpf(1))
+        forced = [self.gain(c, k) * mp.expj(self.omega * t) for t in (begin, end)]
+        rest = self.k_f * x_c / k if stiff else mp.mpf(0)
+        a, b = (mp.matrix([rest + z.real, (mp.j * self.omega * z).real]) for z in forced)
+        return b + self.transition(end - begin, c, k) * (y - a)
+
+    def monodromy(self, contact):
+        """With the saltation at the beginning, where the damper's force jumps; at the end it is zero."""
+        free = self.transition(self.period - contact, self.c, mp.mpf(1))
+        stiff = self.transition(contact, self.c + self.c_f, 1 + self.k_f)
+        return free * stiff * mp.matrix([[1, 0], [-self.c_f, 1]])
+
+    def multipliers(self, touched):
+        free = self.transition(self.period, self.c, mp.mpf(1))
+        m = self.monodromy(mp.mpf(0)) if touched else free
+        return np.linalg.eigvals(np.array(m.tolist(), float))
+
+    @property
+    def corner(self):
+        return abs(self.gain(self.c, 1))
+
+    def critical(self, sign):
+        """The damper with which the multiplier of an orbit that has just touched is `sign`."""
+        d = self.c / 2
+        w = mp.sqrt(1 - d * d)
+        e, angle = mp.exp(-d * self.period), w * self.period
+        return (2 * e * mp.cos(angle) - sign * (1 + e * e)) * w / (e * mp.sin(angle))
+
+    def smooth(self, sign):
+        """x_c where the multiplier of orbits with contact is `sign`, next to the corner."""
+
+        def test(contact):
+            m = self.monodromy(contact)
+            return 1 - sign * (m[0, 0] + m[1, 1]) + m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
+
+        contact = mp.findroot(test, (mp.mpf("1e-3"), mp.mpf("2e-2")))
+
+        def off(begin, x_c, v):
+            y = self.flow(begin, mp.matrix([x_c, v]), begin + contact, True, x_c)
+            z = self.flow(begin + contact, y, begin + self.period, False, x_c)
+            return self.k_f * (y[0] - x_c) + self.c_f * y[1], z[0] - x_c, z[1] - v
+
+        def state(begin):  # x_c and v are the solution of linear equations
+            zero, by_x, by_v = off(begin, 0, 0), off(begin, 1, 0), off(begin, 0, 1)
+            m = mp.matrix([[by_x[i] - zero[i], by_v[i] - zero[i]] for i in (1, 2)])
+            return mp.lu_solve(m, -mp.matrix(zero[1:]))
+
+        top = -mp.arg(self.gain(self.c, 1)) / self.omega
+        guess = top - contact
+        with mp.workdps(50):
+            begin = mp.findroot(lambda t: off(t, *state(t))[0], (guess, guess * (1 + contact / 100)), tol=1e-40)
+            return state(begin)[0]
+
+
+def bumper(omega, sign, less, **options):
+    """The branch from the orbit without contact, for a damper that is a little less than the critical one; and what
+    there should be."""
+    c_f = BumperReference(omega).critical(sign) - less
+    reference = BumperReference(omega, c_f)
+    corner = float(reference.corner)
+    z = complex(reference.gain(reference.c, 1))
+    system = Bumper(c_f=float(c_f), omega=omega, x_c=corner + 0.3)
+    orbit = orbit_of(system, Motion(z.real, -z.imag * omega))
+    return continue_orbit(system, orbit, "x_c", (corner - 0.5, corner + 0.5), **options), reference
+
+
+@pytest.mark.parametrize("less, max_step", [(0.1, 0.02), (0.1, 0.2), (0.01, 0.02), (0.01, 0.2)])
+def test_fold_beside_a_corner(less, max_step):
+    """Pitfall 25: the fold is 6e-5 and 7e-8 away from the corner at which contact begins."""
+    branch, reference = bumper(1.14, 1, less, max_step=max_step)
+    corner, fold = the(branch, float(reference.corner), 1e-9), the(branch, float(reference.smooth(1)), 1e-9)
+    assert (corner.kind, corner.discontinuous, corner.count) == ("none", True, ((1,), (1,)))
+    assert (fold.kind, fold.discontinuous, fold.count) == ("fold", False, ((), (1, 1)))
+    same_multipliers(corner.multipliers, [reference.multipliers(touched) for touched in (False, True)])
+    assert len(branch.branches) == 1 and len(branch.special_points) == 2
+    assert branch.values.min() == pytest.approx(fold.value, abs=1e-10)  # no orbit is beyond
+    ends = sorted([branch.stable[0], branch.stable[-1]])
+    assert ends == [False, True] and branch.values[[0, -1]] == pytest.approx(float(reference.corner) + 0.5)
+
+
+@pytest.mark.parametrize("less, max_step", [(0.1, 0.02), (0.1, 0.2), (0.01, 0.02)])
+def test_flip_beside_a_corner(less, max_step):
+    """Pitfall 25: the flip is 8e-4 and 9e-6 away from it."""
+    branch, reference = bumper(0.727, -1, less, max_step=max_step)
+    corner, flip = the(branch, float(reference.corner), 1e-9), the(branch, float(reference.smooth(-1)), 1e-9)
+    assert (corner.kind, corner.discontinuous, corner.count) == ("none", True, ((1,), (1,)))
+    assert (flip.kind, flip.discontinuous) == ("flip", False)
+    same_multipliers(corner.multipliers, [reference.multipliers(touched) for touched in (False, True)])
+    assert list(branch.values[[0, -1]]) == pytest.approx([float(reference.corner) + s for s in (-0.5, 0.5)])
+    if less == 0.1:  # what is born there ends at the other flip, after two corners of its own
+        assert flip.count == ((1, 2), (1,)) and len(branch.others) == 1
+        ends = branch.others[0].special
+        assert [b.kind for b in ends] == ["flip", "none", "none", "flip"]
+        assert stability_agrees(branch, 6, seed=3) > 4
