@@ -16,8 +16,9 @@ from ._course import start_of
 from ._orbit import Orbit
 from ._orbit_bifurcation import OrbitBifurcation
 from ._orbit_branch import CLOSED, orbit_branch, OrbitBranch, OrbitStrand
-from ._orbit_corner import grazing_at, node_at
+from ._orbit_corner import node_at
 from ._orbit_curve import guard_sizes, OrbitCurve
+from ._orbit_grazing import grazing_at
 from ._orbit_node import Half, itinerary, Node, tracer_for
 from ._orbit_trace import alike, Arc, OrbitTracer, SAME, Spot, turned, Zero
 from ._parameter import get_parameter, parameter_path

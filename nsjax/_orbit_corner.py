@@ -1,21 +1,14 @@
 """Corners of branches of periodic orbits: the orbit touches the tip of a surface, grazes one, or a segment vanishes."""
 
-import dataclasses
-from typing import Any
-
-import jax
-import jax.flatten_util as jfu
-import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import toms748
 
-from ._course import capacity_for, Course, EVENT, FREE, LEAST, same_course, Start, start_from, TIME
+from ._course import capacity_for, EVENT, FREE, Start
 from ._crossings import eigenvalue_crossings
 from ._cycles import corner_kind, CornerMap, Cycle, Cycles, find_cycles
 from ._orbit_bifurcation import named, OrbitBifurcation
-from ._orbit_curve import linearised, OrbitCurve, with_parameter
+from ._orbit_curve import linearised, OrbitCurve
+from ._orbit_half import half_of, NEIGHBOUR
 from ._orbit_node import (
-    admissible,
     branch_point_at,
     cover_of,
     flip_at,
@@ -28,14 +21,11 @@ from ._orbit_node import (
     tracer_for,
     with_order,
 )
-from ._orbit_trace import Arc, CORNERS, OrbitTracer, Spot, Test, turned, Zero
-from ._return_map import Base, follow, frame, return_map, ReturnMap, Touch, touches_of
+from ._orbit_trace import CORNERS, OrbitTracer, Spot, Zero
+from ._return_map import return_map, ReturnMap, Touch, touches_of
 from ._system import impact
 
 
-DEPARTURES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-7)  # at which a half-branch is entered: of the parameter, in its interval
-BACK = 40  # points from there to the corner
-NEIGHBOUR = 1e-5  # at which the corner is known again
 KNOWN = 1e-6  # the digits of a normal form
 
 
@@ -245,212 +235,6 @@ def _reduced(curve: OrbitCurve, monodromy: np.ndarray) -> np.ndarray:
     along = np.real(vectors[:, np.argmin(np.abs(values - 1))])
     frame = np.linalg.svd(along[None])[2][1:]
     return frame @ monodromy @ frame.T
-
-
-def half_of(tracer: OrbitTracer, spot: Spot, points: list[Base], cycle: Cycle) -> Half | None:
-    """The orbit that a cycle of the normal form foretells, a little way off: piece by piece by the flow, which finds
-    its itinerary, and then corrected."""
-    own = tracer_for(tracer, with_order(tracer.curve, int(tracer.curve.order) * cycle.laps))
-    for departure in DEPARTURES:
-        distance = min(departure, 10 * departure / max(1e-12, float(np.abs(cycle.points).max())))
-        found = _entered(own, spot, points, cycle, distance)
-        if found is None or not admissible(own.curve, found):
-            continue
-        found = _beside(own, spot, found if float(found.look.tangent[-1]) * cycle.side >= 0 else turned(found))
-        if found is not None:
-            return Half(found, own.curve, cycle.laps, cycle.side, cycle)
-    return None
-
-
-def _entered(tracer: OrbitTracer, spot: Spot, points: list[Base], cycle: Cycle, distance: float) -> Spot | None:
-    """Corrected across the way on which the foretold orbits lie: at one parameter there may be none, where the branch
-    turns round next to the corner."""
-    curve = tracer.curve
-    near, far = (_foretold(curve, spot, points, cycle, share * distance) for share in (0.5, 1.0))
-    if near is None or far is None or not same_course(near.course, far.course):
-        return None
-    values = [spot.parameter + cycle.side * share * distance * float(curve.width) for share in (0.5, 1.0)]
-    before, guess = (np.asarray(curve.pack(s.filled(), v)) for s, v in zip((near, far), values))
-    return tracer.corrected(far.filled().course, guess, (guess - before) / np.linalg.norm(guess - before))
-
-
-def _beside(tracer: OrbitTracer, at: Spot, found: Spot) -> Spot | None:
-    """The orbit between a corner and whatever else there is on the way to it from an orbit, whose tangent should point
-    away from the corner; None if the way does not come there."""
-    short = dataclasses.replace(tracer, max_points=BACK)
-    for back in (turned(found), found):
-        arc = Arc([back])
-        for _ in short.arc(arc):
-            pass
-        end = arc.end
-        if end is not None and end.test.kind == "guard":
-            end = grazing_at(tracer, end)
-        if end is None or not together(end.spot, at, tracer.curve, NEIGHBOUR):
-            continue
-        if not arc.passed:
-            return turned(back)
-        last, final = arc.spots[-2:]
-        if arc.passed[-1][0] < len(arc.spots) - 2:
-            return turned(last)
-        way = final.look.u - last.look.u
-        between = tracer.corrected(found.course, last.look.u + way / 2, way / np.linalg.norm(way))
-        return None if between is None else turned(between)
-    return None
-
-
-def _foretold(curve: OrbitCurve, spot: Spot, points: list[Base], cycle: Cycle, distance: float) -> Start | None:
-    m, period = len(points), float(spot.look.period)
-    count = m * cycle.laps
-    sizes = np.asarray(curve.sizes)
-    value = spot.parameter + cycle.side * distance * float(curve.width)
-    off = [frame(curve, spot, points[i % m]) @ cycle.points[i] for i in range(count)]
-    x = np.stack([points[i % m].x + distance * sizes * off[i] for i in range(count)])
-    begin = np.array([points[i % m].t for i in range(count)])
-    end = np.array([points[(i + 1) % m].t + (period if (i + 1) % m == 0 else 0) for i in range(count)])
-    modes = np.stack([points[i % m].mode for i in range(count)]).astype(np.int32)
-    lanes = _filled(x, np.full(count, value), begin, end, modes)
-    xs, values, begins, stops, held = lanes
-    _, _, events, good = follow(curve, xs, values, np.asarray(spot.look.parameter), begins, stops, held)
-    if not bool(np.all(np.asarray(good)[:count])):
-        return None
-    here, there = (with_parameter(curve.model, curve.path, jnp.asarray(v)).system for v in (spot.parameter, value))
-    slow = 1.0 if curve.autonomous else float(there.period) / float(here.period)
-    rows = []
-    for lane in range(count):
-        lap = (lane // m) * period * slow
-        for e in _lane(events, lane):
-            after, before = tuple(e.mode_after.values()), tuple(e.mode_before.values())
-            rows.append((float(e.t) + lap, e.switch, before, after, e.y_before, e.y_after))
-    total = cycle.laps * period * slow
-    return start_from(there, curve.like, rows, begin[0] * slow, total, x[0], modes[0])
-
-
-def _lane(events: Any, lane: int) -> Any:
-    return jax.tree.map(lambda leaf: leaf[lane], jax.device_get(events))
-
-
-def _filled(*columns: np.ndarray) -> list[np.ndarray]:
-    """So many lanes that few programs are compiled."""
-    lanes = 16 * -(-len(columns[0]) // 16)
-    return [np.concatenate([c, np.repeat(c[-1:], lanes - len(c), axis=0)]) for c in columns]
-
-
-def grazing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
-    """The orbit at which the least value of a guard along a segment is zero: cut there, that is a smooth equation. Its
-    tests are the segments that end with the cuts."""
-    spot = zero.spot
-    least, where, n = spot.look.least, spot.look.where, int(spot.course.num)
-    # Least values are those of samples; what turns out not to vanish is left out again.
-    near = np.maximum(0.05 * spot.look.most, 10 * abs(least[zero.test.row, zero.test.slot]))
-    both = [(i, j) for i, j in np.argwhere(least < near).tolist() if i < n and 0.002 < where[i, j] < 0.998]
-    both = sorted(both, key=lambda pair: pair != (zero.test.row, zero.test.slot))
-    both = both or [(zero.test.row, zero.test.slot)]
-    while both:
-        cut = _cut(tracer, spot, both)
-        if cut is None:
-            return None
-        at, rows = cut
-        values = np.abs(np.array([at.look.ends[r] for r in rows]))
-        if np.all(values < 1e-9):
-            first, *others = (Test("grazing", row) for row in rows)
-            return zero._replace(spot=at, test=first, others=tuple(others))
-        kept = [pair for pair, v in zip(both, values) if v < 1e-9 or pair == both[0]]
-        if len(kept) == len(both):
-            return None
-        both = kept
-    return None
-
-
-def _cut(tracer: OrbitTracer, spot: Spot, cuts: list[tuple[int, int]]) -> tuple[Spot, list[int]] | None:
-    """The orbit with cuts where these guards are least along these segments, at the parameter at which the first of
-    them vanishes; and the segments that end with the cuts."""
-    curve, look, n = tracer.curve, spot.look, int(spot.course.num)
-    c = spot.course
-    whole = c.ends[0] == TIME
-    rows: list[Any] = []
-    order: list[tuple[int, int]] = []
-    for i in range(n):
-        inside = sorted((float(look.where[i, j]), j) for r, j in cuts if r == i)
-        begin, x = look.begin[i], look.x[i]
-        span = look.end[i] - look.begin[i]
-        for share, j in inside:
-            t = look.begin[i] + share * span
-            entry = _component(curve, look, c, i, j, t)
-            rows.append((c.mode[i], c.part[i], LEAST, j, entry, begin, t, x))
-            order.append((i, j))
-            begin, x = t, look.spots[i, j]
-        rows.append((c.mode[i], c.part[i], c.ends[i], c.slot[i], c.entry[i], begin, look.end[i], x))
-    if whole:  # its beginning is none of its events
-        last = rows.pop()
-        period = float(look.period)
-        first = rows[0]
-        rows[0] = (*first[:5], last[5] - period, first[6], last[7])
-    mode, part, ends, slot, entry, begins, stops, xs = (np.array(column) for column in zip(*rows))
-    ends, slot, entry = (column.astype(np.int32) for column in (ends, slot, entry))
-    course = Course(mode, part, ends, slot, entry, np.asarray(len(rows), np.int32))
-    start = Start(course, begins, stops, xs).filled()
-    at = tracer.corrected(start.course, np.asarray(curve.pack(start, spot.parameter)))
-    if at is None:
-        return None
-    targets = [i for i, row in enumerate(rows) if row[2] == LEAST]
-    by_cut = dict(zip(order, targets))
-    found = _zero_along(tracer, at, by_cut[cuts[0]])
-    return None if found is None else (found, [by_cut[pair] for pair in cuts])
-
-
-def _component(curve: OrbitCurve, look: Any, course: Course, i: int, j: int, t: float) -> int:
-    """Of a guard with several components that which is least there: at a tip another one takes over."""
-    model = with_parameter(curve.model, curve.path, jnp.asarray(look.parameter))
-    state = curve.state(jnp.asarray(course.mode[i]), jnp.asarray(course.part[i]))
-    at = jnp.asarray(look.spots[i, j])
-    when = jnp.asarray(t)
-    values = np.asarray(curve.guards(model, when, at, state))[j]
-    options = [p for p in range(len(values)) if np.isfinite(values[p])]
-    if len(options) < 2:
-        return options[0]
-    f = jfu.ravel_pytree(model.flow(when, curve.unravel(at), state))[0]
-
-    def motion(p: int) -> tuple[float, float]:
-        rate, bend = jax.jvp(lambda t, x: curve.rate(model, t, x, state, j, p), (when, at), (jnp.ones_like(when), f))
-        return float(rate), float(bend)
-
-    motions = [motion(p) for p in options]
-    best, least = options[0], np.inf
-    for p, (rate, bend) in zip(options, motions):
-        # Where it is least itself, is it the one that counts?
-        move = -rate / bend if bend > 0 else np.inf
-        if not abs(move) < least:
-            continue
-        there = [values[q] + r * move + b * move**2 / 2 for q, (r, b) in zip(options, motions)]
-        if there[options.index(p)] >= max(there) - 1e-3 * abs(bend) * move**2 - 1e-3:
-            best, least = p, abs(move)
-    return best
-
-
-def _zero_along(tracer: OrbitTracer, at: Spot, row: int) -> Spot | None:
-    """The point of the curve, next to one, at which the guard at the end of a segment vanishes."""
-    seen = {0.0: at}
-
-    def value(s: float) -> float:
-        if s not in seen:
-            here = tracer.at(at, s)
-            if here is None:
-                raise ArithmeticError
-            seen[s] = here
-        return float(seen[s].look.ends[row])
-
-    if value(0.0) == 0:
-        return at
-    for reach in (1e-3, 1e-2, 5e-2):
-        for s in (reach, -reach):
-            try:
-                if value(s) * value(0.0) <= 0:
-                    root = float(toms748(value, *sorted((0.0, s)), xtol=1e-15, rtol=1e-14, maxiter=60))
-                    value(root)
-                    return seen[root]
-            except ArithmeticError:
-                continue
-    return None
 
 
 def repelled_at(tracer: OrbitTracer, name: str, spot: Spot, rows: list[int]) -> Node | None:

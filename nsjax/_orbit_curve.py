@@ -298,10 +298,13 @@ class OrbitCurve(eqx.Module):
         least, between, most, index, rise, orders = self._least(model, theta, ts, xs, course)
         where, spots = theta[index], jnp.take_along_axis(xs, index[..., None], axis=1)
         rates, values, margins = self._at_ends(model, end, last, course)
+        # Beside a branch point rounding moves the root by more than Newton's method is to find it to.
+        wrong = jnp.max(jnp.abs(f))
+        good = (good | (wrong < TOLERANCE)) & jnp.all(jnp.isfinite(tangent))
         return Look(
-            u, tangent, good & jnp.all(jnp.isfinite(tangent)), value, period, begin, end, x, last, factors, *found,
+            u, tangent, good, value, period, begin, end, x, last, factors, *found,
             rates, values, margins, least, where, most, spots, between, rise, orders, low, high, mean, square, ts, xs,
-            branch, jnp.max(jnp.abs(f)),
+            branch, wrong,
         )  # fmt: skip
 
     def _least(

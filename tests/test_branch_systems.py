@@ -1,16 +1,21 @@
 """Branches of periodic orbits of systems that are not the thesis's, with answers that are known otherwise."""
 
+from typing import Any
+
 import branch_reference
 import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import Motion, pid
-from reference import mp
+import reference
+from models import Motion
 from test_continue_orbit import orbit_of, same_multipliers, stability_agrees, the
 
 import nsjax
 from nsjax import continue_orbit
+
+
+mp: Any = reference.mp
 
 
 class Bumper(nsjax.System):
@@ -39,9 +44,9 @@ class BumperReference:
     """The orbits with one contact, in 50 digits. The monodromy depends on the contact's duration alone, and so the
     duration at a fold or flip is the root of one function."""
 
-    def __init__(self, omega, c_f=None, c=0.1, k_f=4.0):
+    def __init__(self, omega, c_f=0, c=0.1, k_f=4.0):
         self.omega, self.c, self.k_f = (mp.mpf(p) for p in (omega, c, k_f))
-        self.c_f = None if c_f is None else mp.mpf(c_f)
+        self.c_f = mp.mpf(c_f)
         self.period = 2 * mp.pi / self.omega
 
     def gain(self, c, k):
@@ -112,39 +117,83 @@ def bumper(omega, sign, less, **options):
     """The branch from the orbit without contact, for a damper that is a little less than the critical one; and what
     there should be."""
     c_f = BumperReference(omega).critical(sign) - less
-    reference = BumperReference(omega, c_f)
-    corner = float(reference.corner)
-    z = complex(reference.gain(reference.c, 1))
+    known = BumperReference(omega, c_f)
+    corner = float(known.corner)
+    z = complex(known.gain(known.c, 1))
     system = Bumper(c_f=float(c_f), omega=omega, x_c=corner + 0.3)
     orbit = orbit_of(system, Motion(z.real, -z.imag * omega))
-    return continue_orbit(system, orbit, "x_c", (corner - 0.5, corner + 0.5), **options), reference
+    return continue_orbit(system, orbit, "x_c", (corner - 0.5, corner + 0.5), **options), known
 
 
 @pytest.mark.parametrize("less, max_step", [(0.1, 0.02), (0.1, 0.2), (0.01, 0.02), (0.01, 0.2)])
 def test_fold_beside_a_corner(less, max_step):
     """Pitfall 25: the fold is 6e-5 and 7e-8 away from the corner at which contact begins."""
-    branch, reference = bumper(1.14, 1, less, max_step=max_step)
-    corner, fold = the(branch, float(reference.corner), 1e-9), the(branch, float(reference.smooth(1)), 1e-9)
+    branch, known = bumper(1.14, 1, less, max_step=max_step)
+    corner, fold = the(branch, float(known.corner), 1e-9), the(branch, float(known.smooth(1)), 1e-9)
     assert (corner.kind, corner.discontinuous, corner.count) == ("none", True, ((1,), (1,)))
     assert (fold.kind, fold.discontinuous, fold.count) == ("fold", False, ((), (1, 1)))
-    same_multipliers(corner.multipliers, [reference.multipliers(touched) for touched in (False, True)])
+    same_multipliers(corner.multipliers, [known.multipliers(touched) for touched in (False, True)])
     assert len(branch.branches) == 1 and len(branch.special_points) == 2
     assert branch.values.min() == pytest.approx(fold.value, abs=1e-10)  # no orbit is beyond
     ends = sorted([branch.stable[0], branch.stable[-1]])
-    assert ends == [False, True] and branch.values[[0, -1]] == pytest.approx(float(reference.corner) + 0.5)
+    assert ends == [False, True] and branch.values[[0, -1]] == pytest.approx(float(known.corner) + 0.5)
 
 
 @pytest.mark.parametrize("less, max_step", [(0.1, 0.02), (0.1, 0.2), (0.01, 0.02)])
 def test_flip_beside_a_corner(less, max_step):
     """Pitfall 25: the flip is 8e-4 and 9e-6 away from it."""
-    branch, reference = bumper(0.727, -1, less, max_step=max_step)
-    corner, flip = the(branch, float(reference.corner), 1e-9), the(branch, float(reference.smooth(-1)), 1e-9)
+    branch, known = bumper(0.727, -1, less, max_step=max_step)
+    corner, flip = the(branch, float(known.corner), 1e-9), the(branch, float(known.smooth(-1)), 1e-9)
     assert (corner.kind, corner.discontinuous, corner.count) == ("none", True, ((1,), (1,)))
     assert (flip.kind, flip.discontinuous) == ("flip", False)
-    same_multipliers(corner.multipliers, [reference.multipliers(touched) for touched in (False, True)])
-    assert list(branch.values[[0, -1]]) == pytest.approx([float(reference.corner) + s for s in (-0.5, 0.5)])
+    same_multipliers(corner.multipliers, [known.multipliers(touched) for touched in (False, True)])
+    assert list(branch.values[[0, -1]]) == pytest.approx([float(known.corner) + s for s in (-0.5, 0.5)])
     if less == 0.1:  # what is born there ends at the other flip, after two corners of its own
         assert flip.count == ((1, 2), (1,)) and len(branch.others) == 1
         ends = branch.others[0].special
         assert [b.kind for b in ends] == ["flip", "none", "none", "flip"]
         assert stability_agrees(branch, 6, seed=3) > 4
+
+
+class Filtered(nsjax.System):
+    """Section 6.8, its force from a first-order filter that leaves amplitude and phase as they are: the bifurcations of
+    section 6.8, and a multiplier exp(-T / τ) more."""
+
+    tau: float = 2.0
+    c: float = 0.01
+    f_0: float = 2.5
+    omega: float = 0.8
+
+    def vector_field(self, t, y, s):
+        phase = self.omega * t
+        drive = self.f_0 * (jnp.cos(phase) - self.omega * self.tau * jnp.sin(phase))
+        force = y["z"] - s.friction
+        return {"x": y["v"], "v": force - self.c * y["v"] - y["x"], "z": (drive - y["z"]) / self.tau}
+
+    @nsjax.sgn
+    def friction(self, t, y):
+        return y["v"]
+
+    @friction.breakaway
+    def friction(self):
+        return 2.0
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+@pytest.mark.slow
+def test_three_states():
+    """A third state, in a dictionary, and another solver."""
+    orbit = orbit_of(Filtered(), dict(x=5.4, v=2.7, z=2.5))
+    branch = continue_orbit(orbit.system, orbit, "omega", (0.5, 0.85), solver=dfx.Tsit5())
+    kinds = {"A": ("symmetry breaking", False), "B": ("symmetry breaking", True), "C": ("none", True)}
+    for name, kind in kinds.items():
+        want = branch_reference.POINTS[f"6.8 {name}"]
+        point = the(branch, want.at, 1e-10)
+        assert (point.kind, point.discontinuous) == kind
+        more = np.exp(-want.period / orbit.system.tau)
+        two = list(want.multipliers.values())[:2]
+        same_multipliers(point.multipliers, [(*two[0], more), (*two[-1], more)])
+    assert len(branch.branches) == 2 and len(branch.special_points) == 4  # C, and its image

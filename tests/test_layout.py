@@ -78,6 +78,8 @@ ORDER = (
     "_return_map",
     "_orbit_bifurcation",
     "_orbit_node",
+    "_orbit_grazing",
+    "_orbit_half",
     "_orbit_corner",
     "_orbit_branch",
     "_continue_orbit",

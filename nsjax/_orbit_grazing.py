@@ -1,0 +1,131 @@
+"""Where an orbit of a branch grazes a surface: a cut where the guard is least makes that a smooth equation."""
+
+from typing import Any
+
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import toms748
+
+from ._course import Course, LEAST, Start, TIME
+from ._orbit_curve import OrbitCurve, with_parameter
+from ._orbit_trace import OrbitTracer, Spot, Test, Zero
+
+
+def grazing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
+    """The orbit at which the least value of a guard along a segment is zero: cut there, that is a smooth equation. Its
+    tests are the segments that end with the cuts."""
+    spot = zero.spot
+    least, where, n = spot.look.least, spot.look.where, int(spot.course.num)
+    # Least values are those of samples; what turns out not to vanish is left out again.
+    near = np.maximum(0.05 * spot.look.most, 10 * abs(least[zero.test.row, zero.test.slot]))
+    both = [(i, j) for i, j in np.argwhere(least < near).tolist() if i < n and 0.002 < where[i, j] < 0.998]
+    both = sorted(both, key=lambda pair: pair != (zero.test.row, zero.test.slot))
+    both = both or [(zero.test.row, zero.test.slot)]
+    while both:
+        cut = _cut(tracer, spot, both)
+        if cut is None:
+            return None
+        at, rows = cut
+        values = np.abs(np.array([at.look.ends[r] for r in rows]))
+        if np.all(values < 1e-9):
+            first, *others = (Test("grazing", row) for row in rows)
+            return zero._replace(spot=at, test=first, others=tuple(others))
+        kept = [pair for pair, v in zip(both, values) if v < 1e-9 or pair == both[0]]
+        if len(kept) == len(both):
+            return None
+        both = kept
+    return None
+
+
+def _cut(tracer: OrbitTracer, spot: Spot, cuts: list[tuple[int, int]]) -> tuple[Spot, list[int]] | None:
+    """The orbit with cuts where these guards are least along these segments, at the parameter at which the first of
+    them vanishes; and the segments that end with the cuts."""
+    curve, look, n = tracer.curve, spot.look, int(spot.course.num)
+    c = spot.course
+    whole = c.ends[0] == TIME
+    rows: list[Any] = []
+    order: list[tuple[int, int]] = []
+    for i in range(n):
+        inside = sorted((float(look.where[i, j]), j) for r, j in cuts if r == i)
+        begin, x = look.begin[i], look.x[i]
+        span = look.end[i] - look.begin[i]
+        for share, j in inside:
+            t = look.begin[i] + share * span
+            entry = _component(curve, look, c, i, j, t)
+            rows.append((c.mode[i], c.part[i], LEAST, j, entry, begin, t, x))
+            order.append((i, j))
+            begin, x = t, look.spots[i, j]
+        rows.append((c.mode[i], c.part[i], c.ends[i], c.slot[i], c.entry[i], begin, look.end[i], x))
+    if whole:  # its beginning is none of its events
+        last = rows.pop()
+        period = float(look.period)
+        first = rows[0]
+        rows[0] = (*first[:5], last[5] - period, first[6], last[7])
+    mode, part, ends, slot, entry, begins, stops, xs = (np.array(column) for column in zip(*rows))
+    ends, slot, entry = (column.astype(np.int32) for column in (ends, slot, entry))
+    course = Course(mode, part, ends, slot, entry, np.asarray(len(rows), np.int32))
+    start = Start(course, begins, stops, xs).filled()
+    at = tracer.corrected(start.course, np.asarray(curve.pack(start, spot.parameter)))
+    if at is None:
+        return None
+    targets = [i for i, row in enumerate(rows) if row[2] == LEAST]
+    by_cut = dict(zip(order, targets))
+    found = _zero_along(tracer, at, by_cut[cuts[0]])
+    return None if found is None else (found, [by_cut[pair] for pair in cuts])
+
+
+def _component(curve: OrbitCurve, look: Any, course: Course, i: int, j: int, t: float) -> int:
+    """Of a guard with several components that which is least there: at a tip another one takes over."""
+    model = with_parameter(curve.model, curve.path, jnp.asarray(look.parameter))
+    state = curve.state(jnp.asarray(course.mode[i]), jnp.asarray(course.part[i]))
+    at = jnp.asarray(look.spots[i, j])
+    when = jnp.asarray(t)
+    values = np.asarray(curve.guards(model, when, at, state))[j]
+    options = [p for p in range(len(values)) if np.isfinite(values[p])]
+    if len(options) < 2:
+        return options[0]
+    f = jfu.ravel_pytree(model.flow(when, curve.unravel(at), state))[0]
+
+    def motion(p: int) -> tuple[float, float]:
+        rate, bend = jax.jvp(lambda t, x: curve.rate(model, t, x, state, j, p), (when, at), (jnp.ones_like(when), f))
+        return float(rate), float(bend)
+
+    motions = [motion(p) for p in options]
+    best, least = options[0], np.inf
+    for p, (rate, bend) in zip(options, motions):
+        # Where it is least itself, is it the one that counts?
+        move = -rate / bend if bend > 0 else np.inf
+        if not abs(move) < least:
+            continue
+        there = [values[q] + r * move + b * move**2 / 2 for q, (r, b) in zip(options, motions)]
+        if there[options.index(p)] >= max(there) - 1e-3 * abs(bend) * move**2 - 1e-3:
+            best, least = p, abs(move)
+    return best
+
+
+def _zero_along(tracer: OrbitTracer, at: Spot, row: int) -> Spot | None:
+    """The point of the curve, next to one, at which the guard at the end of a segment vanishes."""
+    seen = {0.0: at}
+
+    def value(s: float) -> float:
+        if s not in seen:
+            here = tracer.at(at, s)
+            if here is None:
+                raise ArithmeticError
+            seen[s] = here
+        return float(seen[s].look.ends[row])
+
+    if value(0.0) == 0:
+        return at
+    for reach in (1e-3, 1e-2, 5e-2):
+        for s in (reach, -reach):
+            try:
+                if value(s) * value(0.0) <= 0:
+                    root = float(toms748(value, *sorted((0.0, s)), xtol=1e-15, rtol=1e-14, maxiter=60))
+                    value(root)
+                    return seen[root]
+            except ArithmeticError:
+                continue
+    return None

@@ -1,0 +1,109 @@
+"""The half-branches that the normal form of a corner foretells, entered next to it."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ._course import same_course, Start, start_from
+from ._cycles import Cycle
+from ._orbit_curve import OrbitCurve, with_parameter
+from ._orbit_grazing import grazing_at
+from ._orbit_node import admissible, Half, together, tracer_for, with_order
+from ._orbit_trace import Arc, OrbitTracer, Spot, turned
+from ._return_map import Base, follow, frame
+
+
+DEPARTURES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-7)  # at which a half-branch is entered: of the parameter, in its interval
+BACK = 40  # points from there to the corner
+NEIGHBOUR = 1e-5  # at which the corner is known again
+
+
+def half_of(tracer: OrbitTracer, spot: Spot, points: list[Base], cycle: Cycle) -> Half | None:
+    """The orbit that a cycle of the normal form foretells, a little way off: piece by piece by the flow, which finds
+    its itinerary, and then corrected."""
+    own = tracer_for(tracer, with_order(tracer.curve, int(tracer.curve.order) * cycle.laps))
+    for departure in DEPARTURES:
+        distance = min(departure, 10 * departure / max(1e-12, float(np.abs(cycle.points).max())))
+        found = _entered(own, spot, points, cycle, distance)
+        if found is None or not admissible(own.curve, found):
+            continue
+        found = _beside(own, spot, found if float(found.look.tangent[-1]) * cycle.side >= 0 else turned(found))
+        if found is not None:
+            return Half(found, own.curve, cycle.laps, cycle.side, cycle)
+    return None
+
+
+def _entered(tracer: OrbitTracer, spot: Spot, points: list[Base], cycle: Cycle, distance: float) -> Spot | None:
+    """Corrected across the way on which the foretold orbits lie: at one parameter there may be none, where the branch
+    turns round next to the corner."""
+    curve = tracer.curve
+    near, far = (_foretold(curve, spot, points, cycle, share * distance) for share in (0.5, 1.0))
+    if near is None or far is None or not same_course(near.course, far.course):
+        return None
+    values = [spot.parameter + cycle.side * share * distance * float(curve.width) for share in (0.5, 1.0)]
+    before, guess = (np.asarray(curve.pack(s.filled(), v)) for s, v in zip((near, far), values))
+    return tracer.corrected(far.filled().course, guess, (guess - before) / np.linalg.norm(guess - before))
+
+
+def _beside(tracer: OrbitTracer, at: Spot, found: Spot) -> Spot | None:
+    """The orbit between a corner and whatever else there is on the way to it from an orbit, whose tangent should point
+    away from the corner; None if the way does not come there."""
+    short = dataclasses.replace(tracer, max_points=BACK)
+    for back in (turned(found), found):
+        arc = Arc([back])
+        for _ in short.arc(arc):
+            pass
+        end = arc.end
+        if end is not None and end.test.kind == "guard":
+            end = grazing_at(tracer, end)
+        if end is None or not together(end.spot, at, tracer.curve, NEIGHBOUR):
+            continue
+        if not arc.passed:
+            return turned(back)
+        last, final = arc.spots[-2:]
+        if arc.passed[-1][0] < len(arc.spots) - 2:
+            return turned(last)
+        way = final.look.u - last.look.u
+        between = tracer.corrected(found.course, last.look.u + way / 2, way / np.linalg.norm(way))
+        return None if between is None else turned(between)
+    return None
+
+
+def _foretold(curve: OrbitCurve, spot: Spot, points: list[Base], cycle: Cycle, distance: float) -> Start | None:
+    m, period = len(points), float(spot.look.period)
+    count = m * cycle.laps
+    sizes = np.asarray(curve.sizes)
+    value = spot.parameter + cycle.side * distance * float(curve.width)
+    off = [frame(curve, spot, points[i % m]) @ cycle.points[i] for i in range(count)]
+    x = np.stack([points[i % m].x + distance * sizes * off[i] for i in range(count)])
+    begin = np.array([points[i % m].t for i in range(count)])
+    end = np.array([points[(i + 1) % m].t + (period if (i + 1) % m == 0 else 0) for i in range(count)])
+    modes = np.stack([points[i % m].mode for i in range(count)]).astype(np.int32)
+    lanes = _filled(x, np.full(count, value), begin, end, modes)
+    xs, values, begins, stops, held = lanes
+    _, _, events, good = follow(curve, xs, values, np.asarray(spot.look.parameter), begins, stops, held)
+    if not bool(np.all(np.asarray(good)[:count])):
+        return None
+    here, there = (with_parameter(curve.model, curve.path, jnp.asarray(v)).system for v in (spot.parameter, value))
+    slow = 1.0 if curve.autonomous else float(there.period) / float(here.period)
+    rows = []
+    for lane in range(count):
+        lap = (lane // m) * period * slow
+        for e in _lane(events, lane):
+            after, before = tuple(e.mode_after.values()), tuple(e.mode_before.values())
+            rows.append((float(e.t) + lap, e.switch, before, after, e.y_before, e.y_after))
+    total = cycle.laps * period * slow
+    return start_from(there, curve.like, rows, begin[0] * slow, total, x[0], modes[0])
+
+
+def _lane(events: Any, lane: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[lane], jax.device_get(events))
+
+
+def _filled(*columns: np.ndarray) -> list[np.ndarray]:
+    """So many lanes that few programs are compiled."""
+    lanes = 16 * -(-len(columns[0]) // 16)
+    return [np.concatenate([c, np.repeat(c[-1:], lanes - len(c), axis=0)]) for c in columns]
