@@ -1,6 +1,7 @@
 """Branches of equilibria."""
 
 import dataclasses
+import os
 from typing import Any
 
 import equinox as eqx
@@ -8,8 +9,10 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._bifurcation import Bifurcation, NOT_BIFURCATIONS, unstable_number
+from ._archive import Archive, save, table
+from ._bifurcation import Bifurcation, HalfBranch, NOT_BIFURCATIONS, unstable_number
 from ._equilibrium_curve import Record
+from ._pencil import EigenvalueCrossing
 from ._system import System
 from ._types import Y
 
@@ -62,6 +65,15 @@ class Branch(eqx.Module):
             found |= {id(b): b for b in branch.special if b.kind not in NOT_BIFURCATIONS}
         return tuple(sorted(found.values(), key=lambda b: b.value))
 
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes the branch and the others to a file, an `.npz` of plain arrays with a description in JSON."""
+        save(path, "Branch", TYPES, self.system, jax.tree.map(lambda x: x[0], self.ys), {"branch": self})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike, system: System, y: Y | None = None) -> "Branch":
+        """Reads what `save` wrote; arguments and errors as for `OrbitBranch.load`."""
+        return Archive(path, "Branch", TYPES, system, y).part("branch")
+
     def __len__(self) -> int:
         return len(self.values)
 
@@ -84,6 +96,9 @@ def _stability(branch: Branch) -> str:
     words = ["stable" if s else "unstable" for s in branch.stable]
     runs = [word for i, word in enumerate(words) if i == 0 or words[i - 1] != word]
     return ", then ".join(runs) if len(runs) <= 6 else f"{len(runs)} changes of stability"
+
+
+TYPES = table(Branch, Bifurcation, HalfBranch, EigenvalueCrossing)
 
 
 @dataclasses.dataclass

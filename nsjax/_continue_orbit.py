@@ -1,8 +1,8 @@
 """The continuation of periodic orbits over a parameter, through folds and corners, along every branch."""
 
 import dataclasses
+import os
 import warnings
-from collections.abc import Iterator
 from typing import Any
 
 import diffrax as dfx
@@ -11,21 +11,28 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 
+from ._archive import Archive, plain, save, table
 from ._arcs import model_of
-from ._course import start_of
+from ._course import Course, start_of
+from ._cycles import Cycle
 from ._orbit import Orbit
-from ._orbit_bifurcation import OrbitBifurcation
-from ._orbit_branch import CLOSED, orbit_branch, OrbitBranch, OrbitStrand
-from ._orbit_corner import node_at
-from ._orbit_curve import guard_sizes, OrbitCurve
-from ._orbit_grazing import grazing_at
-from ._orbit_node import Half, itinerary, Node, tracer_for
-from ._orbit_trace import alike, Arc, OrbitTracer, SAME, Spot, turned, Zero
+from ._orbit_branch import orbit_branch, OrbitBranch, OrbitStrand, Point, TYPES as OF_BRANCHES
+from ._orbit_curve import guard_sizes, Look, OrbitCurve
+from ._orbit_node import Half, itinerary, Node
+from ._orbit_trace import Arc, OrbitTracer, Spot, Test, Zero
+from ._orbit_tree import OrbitExplorer, OrbitTree, Walk
 from ._parameter import get_parameter, parameter_path
 from ._segment_flow import exactness
 from ._solution import is_okay
 from ._system import arrays_of, System
 from ._types import Y
+
+
+GIVEN = ("model", "path", "like", "how")  # what of a curve follows from the model, and is not saved
+TYPES = {
+    **OF_BRANCHES,
+    **table(OrbitTree, Walk, Arc, Zero, Test, Spot, Look, Course, Node, Half, Cycle, OrbitStrand, Point),
+}
 
 
 def continue_orbit(
@@ -97,9 +104,11 @@ class OrbitGrowth:
         if point.parameter > 1.9:
             break
     print(growth.branch)  # what there is so far; go on iterating for more
+    growth.save("growth.npz")
+    growth = nsjax.OrbitGrowth.load("growth.npz", system)  # some other day
     ```
 
-    The arguments are those of `continue_orbit`.
+    An interrupt (Ctrl-C), wherever it comes, leaves a growth that can be gone on with. The arguments are those of `continue_orbit`.
     """
 
     def __init__(
@@ -135,9 +144,6 @@ class OrbitGrowth:
                 f"Argument `interval` must be (low, high) and hold {value:.6g}, the value of `{parameter}` in "
                 f"`system`, but is ({low:.6g}, {high:.6g})."
             )
-        if stepsize_controller is None:
-            stepsize_controller = dfx.PIDController(rtol=1e-12, atol=1e-12)
-        how = (("solver", solver), ("stepsize_controller", stepsize_controller), ("max_steps", max_steps))
         order = 1
         if system.period is not None:
             order = int(round(float(orbit.period) / float(system.period)))
@@ -163,7 +169,7 @@ class OrbitGrowth:
             order=np.asarray(order, np.int32),
             normal=np.zeros_like(sizes),
             reference=np.asarray(flat),
-            how=how,
+            how=_how(solver, stepsize_controller, max_steps),
             exact=exactness(model, jnp.asarray(orbit.t0), orbit.y0),
         )
         if system.period is None:
@@ -176,16 +182,91 @@ class OrbitGrowth:
         spot = tracer.corrected(start.course, np.asarray(curve.pack(start, value)))
         if spot is None:
             raise ValueError("Argument `orbit` must be an orbit of `system`, but none was found next to it.")
-        self._tree = _Tree(tracer, system, parameter, max_branches, max_laps * order, spot)
-        self._points = self._tree.grow()
+        self._explorer = OrbitExplorer(tracer, parameter, max_branches, max_laps * order)
+        self._tree = self._explorer.planted(spot)
 
-    def __iter__(self) -> Iterator[Spot]:
-        return self._points
+    def __iter__(self) -> "OrbitGrowth":
+        return self
+
+    def __next__(self) -> Spot:
+        while self._tree.walk is not None:
+            self._tree, point = self._explorer.further(self._tree)
+            if self._tree.walk is None and next(self._tree.places(), None) is not None:
+                warnings.warn(
+                    f"There are more than `max_branches` = {self._explorer.max_branches} branches.", stacklevel=3
+                )
+            if point is not None:
+                return point
+        raise StopIteration
 
     @property
     def branch(self) -> OrbitBranch:
         """What was found so far."""
-        return self._tree.result()
+        curve, name = self._explorer.tracer.curve, self._explorer.name
+        found = [orbit_branch(curve, curve.model.system, name, *pair, itinerary) for pair in self._tree.branches]
+        return dataclasses.replace(found[0], others=tuple(found[1:]))
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes all that is known so far to a file, an `.npz` of plain arrays with a description in JSON: at any time,
+        also after an interrupt."""
+        curve, explorer = self._explorer.tracer.curve, self._explorer
+        parts = dict(
+            how=plain(repr(curve.how)),
+            curve={f.name: getattr(curve, f.name) for f in dataclasses.fields(curve) if f.name not in GIVEN},
+            t0=self._tree.start.look.begin[0],
+            tracer=dict(max_step=explorer.tracer.max_step, max_points=explorer.tracer.max_points),
+            explorer=dict(name=explorer.name, max_branches=explorer.max_branches, max_order=explorer.max_order),
+            tree=self._tree,
+        )
+        save(path, "OrbitGrowth", TYPES, curve.model.system, curve.like, parts, curve=curve)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | os.PathLike,
+        system: System,
+        y: Y | None = None,
+        *,
+        solver: dfx.AbstractSolver = dfx.Dopri8(),
+        stepsize_controller: dfx.AbstractStepSizeController | None = None,
+        max_steps: int = 4096,
+    ) -> "OrbitGrowth":
+        """Reads what `save` wrote, to go on with it as if nothing had happened. Nothing in the file is executed.
+
+        **Arguments:**
+
+        - `path`: the file.
+        - `system`: a model of the same class and shapes; the values of its parameters are taken from the file.
+        - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
+            NamedTuples.
+        - `solver`, `stepsize_controller`, `max_steps`: those with which it was begun.
+
+        **Raises:** `ValueError` for a file that is damaged, is none of `save`'s, or is of another model or solver.
+        """
+        archive = Archive(path, "OrbitGrowth", TYPES, system, y)
+        how = _how(solver, stepsize_controller, max_steps)
+        if plain(repr(how)) != archive.part("how"):
+            raise ValueError(
+                "Arguments `solver`, `stepsize_controller` and `max_steps` must be those with which the branch was "
+                f"begun, {archive.part('how')}, but are {plain(repr(how))}."
+            )
+        given = archive.part("explorer")
+        curve = OrbitCurve(
+            model=model_of(archive.system, jnp.asarray(archive.part("t0")), archive.y),
+            path=parameter_path(archive.system, given["name"]),
+            like=archive.y,
+            how=how,
+            **archive.part("curve"),
+        )
+        growth = cls.__new__(cls)
+        growth._explorer = OrbitExplorer(OrbitTracer(curve, **archive.part("tracer")), **given)
+        growth._tree = archive.part("tree", curve=curve)
+        return growth
+
+
+def _how(solver: Any, stepsize_controller: Any, max_steps: int) -> tuple[tuple[str, Any], ...]:
+    controller = dfx.PIDController(rtol=1e-12, atol=1e-12) if stepsize_controller is None else stepsize_controller
+    return (("solver", solver), ("stepsize_controller", controller), ("max_steps", max_steps))
 
 
 def _points(orbit: Orbit) -> list[Any]:
@@ -193,160 +274,3 @@ def _points(orbit: Orbit) -> list[Any]:
     rows = jax.vmap(jax.vmap(lambda y: jfu.ravel_pytree(y)[0]))(path.y)
     rows = np.asarray(rows).reshape(-1, rows.shape[-1])
     return list(rows[np.isfinite(rows).all(axis=1)])
-
-
-@dataclasses.dataclass
-class _Tree:
-    """The branches that hang together, found by following every half-branch of every node once."""
-
-    tracer: OrbitTracer
-    system: System
-    name: str
-    max_branches: int
-    max_order: int
-    start: Spot
-    nodes: list[Node] = dataclasses.field(default_factory=list)
-    found: list[tuple[OrbitStrand, OrbitStrand]] = dataclasses.field(default_factory=list)
-
-    def grow(self) -> Iterator[Spot]:
-        back, ahead = OrbitStrand(end="the start"), OrbitStrand()
-        self.found.append((back, ahead))
-        order = int(self.tracer.curve.order)
-        spot = self.start if self.start.look.tangent[-1] >= 0 else turned(self.start)
-        for strand, outset in ((ahead, spot), (back, turned(spot))):
-            if strand is back:
-                if ahead.end == CLOSED:
-                    break
-                back.end = ""
-            strand.spots.append((outset, order))
-            yield from self.walk(strand, outset, self.tracer.curve, outset)
-        for node in self.nodes:  # which grow in number meanwhile
-            for half in node.halves:
-                if half.used or len(self.found) >= self.max_branches:
-                    continue
-                half.used = True
-                back, ahead = OrbitStrand(end=self.named(node)), OrbitStrand()
-                self.found.append((back, ahead))
-                partner = half.partner
-                yield from self.leave(ahead, node, half)
-                if partner is not None and not partner.used:
-                    partner.used = True
-                    back.end = ""
-                    yield from self.leave(back, node, partner)
-        if any(not half.used for node in self.nodes for half in node.halves):
-            warnings.warn(f"There are more than `max_branches` = {self.max_branches} branches.", stacklevel=4)
-
-    def named(self, node: Node) -> str:
-        return f"{node.bifurcation.name} at {self.name} = {node.bifurcation.value:.6g}"
-
-    def leave(self, strand: OrbitStrand, node: Node, half: Half) -> Iterator[Spot]:
-        self.depart(strand, node, half)
-        strand.special.append((0, node.bifurcation))
-        yield from self.walk(strand, half.spot, half.curve, None)
-
-    def depart(self, strand: OrbitStrand, node: Node, half: Half) -> None:
-        """The point itself, with the multipliers that the half-branch has there."""
-        order = int(half.curve.order)
-        spot = node.spot
-        if node.bifurcation.discontinuous:
-            spot = dataclasses.replace(spot, multipliers=half.multipliers, stable=half.spot.stable)
-        strand.spots += [(spot, order), (half.spot, order)]
-
-    def walk(self, strand: OrbitStrand, spot: Spot, curve: OrbitCurve, begin: Spot | None) -> Iterator[Spot]:
-        """Along a branch, through corners and branch points, to its end."""
-        while True:
-            tracer, order = tracer_for(self.tracer, curve), int(curve.order)
-            arc = Arc([spot])
-            seen, noted = 1, 0
-            for point in tracer.arc(arc, begin):
-                strand.spots += [(s, order) for s in arc.spots[seen:]]
-                for index, zero in arc.passed[noted:]:
-                    made = self.passed(tracer, arc, index, zero)
-                    if made is not None:
-                        strand.special.append((len(strand.spots) - (len(arc.spots) - index), made))
-                seen, noted = len(arc.spots), len(arc.passed)
-                yield point
-            if arc.closed or arc.end is None:
-                strand.end = CLOSED if arc.closed else arc.why
-                return
-            zero = arc.end
-            if zero.test.kind in ("low", "high"):
-                strand.end = f"{self.name} = {zero.spot.parameter:.6g}"
-                return
-            if zero.test.kind == "guard":
-                zero = grazing_at(tracer, zero) or zero
-                strand.spots[-1] = (zero.spot, order)
-            node = next((n for n in self.nodes if n.is_at(zero, curve)), None)
-            if node is None:
-                laps = max(1, self.max_order // order)
-                node = node_at(tracer, self.name, zero, laps)
-                if node is None:
-                    strand.end = f"{zero.test.kind} at {self.name} = {zero.spot.parameter:.10g}"
-                    return
-                self.nodes.append(node)
-            strand.special.append((len(strand.spots) - 1, node.bifurcation))
-            arrived = self.arrived(tracer, node, arc)
-            ahead = None if arrived is None else arrived.partner
-            last = dataclasses.replace(strand.spots[-1][0], stable=strand.spots[-2][0].stable)
-            if arrived is not None:
-                arrived.used = True
-                if node.bifurcation.discontinuous:
-                    last = dataclasses.replace(last, multipliers=arrived.multipliers)
-            strand.spots[-1] = (last, order)
-            if ahead is None or ahead.used:
-                strand.end = self.named(node)
-                return
-            ahead.used = True
-            self.depart(strand, node, ahead)
-            spot, curve = ahead.spot, ahead.curve
-
-    def passed(self, tracer: OrbitTracer, arc: Arc, index: int, zero: Zero) -> OrbitBifurcation | None:
-        """A bifurcation through which the branch goes on as it is."""
-        curve, spot = tracer.curve, zero.spot
-        if zero.test.kind == "flip":
-            node = next((n for n in self.nodes if n.is_at(zero, curve)), None)
-            if node is None:
-                node = node_at(tracer, self.name, zero, 2)
-                if node is None:
-                    return None
-                if 2 * int(curve.order) <= self.max_order:
-                    self.nodes.append(node)
-            return node.bifurcation
-        side = 0
-        if zero.test.kind == "fold":
-            side = 1 if arc.spots[index - 1].parameter > spot.parameter else -1
-        return OrbitBifurcation.smooth(zero.test.kind, self.name, spot, curve, [], side)
-
-    def arrived(self, tracer: OrbitTracer, node: Node, arc: Arc) -> Half | None:
-        """On which half-branch the branch came: that which has the same orbit at the same parameter."""
-        curve, order = tracer.curve, int(tracer.curve.order)
-        for half in node.halves:
-            if int(half.curve.order) != order:
-                continue
-            target = half.spot.parameter
-            for a, b in zip(arc.spots[-2::-1], arc.spots[:0:-1]):
-                if not min(a.parameter, b.parameter) <= target <= max(a.parameter, b.parameter):
-                    continue
-                here = tracer.between(a, b, target) if len(a.look.u) == len(b.look.u) else None
-                if here is not None and alike(here, half.spot, curve, SAME):
-                    return half
-                break
-            # Beside a branch point the way from the other side is safer.
-            last = arc.spots[-2] if len(arc.spots) > 1 else arc.spots[-1]
-            step = tracer.at(half.spot, 1.5 * float(np.linalg.norm(last.look.u - arc.spots[-1].look.u)))
-            here = None if step is None else tracer.between(half.spot, step, last.parameter)
-            if here is not None and alike(here, last, curve, SAME):
-                return half
-        # Through a corner there is one curve in each course.
-        key = arc.spots[-1].course.key()
-        same = [h for h in node.halves if int(h.curve.order) == order and h.spot.course.key() == key]
-        return same[0] if len(same) == 1 and node.bifurcation.discontinuous else None
-
-    def result(self) -> OrbitBranch:
-        made = [
-            orbit_branch(self.tracer.curve, self.system, self.name, back, ahead, itinerary)
-            for back, ahead in self.found
-            if back.spots or ahead.spots
-        ]
-        first, *others = made
-        return dataclasses.replace(first, others=tuple(others))

@@ -2,7 +2,8 @@
 
 import dataclasses
 import math
-from typing import Any
+import os
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,9 +11,11 @@ import jax.flatten_util as jfu
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._orbit_bifurcation import OrbitBifurcation
+from ._archive import Archive, save, table
+from ._orbit_bifurcation import OrbitBifurcation, OrbitHalf
 from ._orbit_curve import OrbitCurve
 from ._orbit_trace import midpoint, Spot
+from ._pencil import EigenvalueCrossing
 from ._system import System
 from ._types import Y
 
@@ -78,6 +81,25 @@ class OrbitBranch(eqx.Module):
         """Those of them that are bifurcations."""
         return tuple(b for b in self.special_points if b.kind not in NOT_BIFURCATIONS)
 
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes the branch and the others to a file, an `.npz` of plain arrays with a description in JSON."""
+        save(path, "OrbitBranch", TYPES, self.system, jax.tree.map(lambda x: x[0], self.ys), {"branch": self})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike, system: System, y: Y | None = None) -> "OrbitBranch":
+        """Reads what `save` wrote. Nothing in the file is executed.
+
+        **Arguments:**
+
+        - `path`: the file.
+        - `system`: a model of the same class and shapes; the values of its parameters are taken from the file.
+        - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
+            NamedTuples.
+
+        **Raises:** `ValueError` for a file that is damaged, is none of `save`'s, or is of another model.
+        """
+        return Archive(path, "OrbitBranch", TYPES, system, y).part("branch")
+
     def __len__(self) -> int:
         return len(self.values)
 
@@ -101,23 +123,44 @@ class OrbitBranch(eqx.Module):
         return "\n".join(lines)
 
 
-@dataclasses.dataclass
-class OrbitStrand:
-    """Points one after the other, and the special ones among them, while they are found."""
+TYPES = table(OrbitBranch, OrbitBifurcation, OrbitHalf, EigenvalueCrossing)
 
-    spots: list[tuple[Spot, int]] = dataclasses.field(default_factory=list)  # with their order
-    special: list[tuple[int, OrbitBifurcation]] = dataclasses.field(default_factory=list)
+
+class Point(NamedTuple):
+    """A point of a strand, and of how many periods of the forcing its orbits are."""
+
+    spot: Spot
+    order: int
+
+
+@dataclasses.dataclass(frozen=True)
+class OrbitStrand:
+    """Points one after the other, and the special ones among them."""
+
+    points: tuple[Point, ...] = ()
+    special: tuple[tuple[int, OrbitBifurcation], ...] = ()
     end: str = ""
 
+    def then(self, point: Point) -> "OrbitStrand":
+        return dataclasses.replace(self, points=(*self.points, point))
+
+    def ending(self, point: Point) -> "OrbitStrand":
+        """With another last point."""
+        return dataclasses.replace(self, points=(*self.points[:-1], point))
+
+    def noting(self, bifurcation: OrbitBifurcation) -> "OrbitStrand":
+        """With the last point as a special one."""
+        return dataclasses.replace(self, special=(*self.special, (len(self.points) - 1, bifurcation)))
+
     def reversed(self) -> "OrbitStrand":
-        last = len(self.spots) - 1
+        values, last = [point.spot.parameter for point in self.points], len(self.points) - 1
 
         def index(i: int) -> int:
             """Of a corner that is there twice, the first of the two."""
-            twice = i < last and math.isclose(self.spots[i + 1][0].parameter, self.spots[i][0].parameter, rel_tol=1e-10)
+            twice = i < last and math.isclose(values[i + 1], values[i], rel_tol=1e-10)
             return last - i - 1 if twice else last - i
 
-        return OrbitStrand(self.spots[::-1], [(index(i), b) for i, b in self.special[::-1]], self.end)
+        return OrbitStrand(self.points[::-1], tuple((index(i), b) for i, b in self.special[::-1]), self.end)
 
 
 def orbit_branch(
@@ -125,17 +168,18 @@ def orbit_branch(
 ) -> OrbitBranch:
     """Two strands that set out from one point as one branch: upwards, if there is a choice."""
     ends = (back.end, ahead.end)
-    turned = back.reversed()
-    keep = len(turned.spots)
-    common = bool(turned.special and ahead.special) and turned.special[-1][1] is ahead.special[0][1]
-    if keep and ahead.spots and turned.spots[-1][0] is ahead.spots[0][0] and not common:
-        keep -= 1
-    strand = OrbitStrand(turned.spots[:keep] + ahead.spots)
-    strand.special = [(i, b) for i, b in turned.special if i < keep]
-    strand.special += [(i + keep, b) for i, b in ahead.special if not (common and i == 0)]
-    if strand.spots[0][0].parameter > strand.spots[-1][0].parameter:
+    first, keep = back.reversed(), len(back.points)
+    common = bool(first.special and ahead.special) and first.special[-1][1] is ahead.special[0][1]
+    if keep and ahead.points and not common:
+        keep -= first.points[-1].spot.look.u is ahead.points[0].spot.look.u
+    strand = OrbitStrand(
+        first.points[:keep] + ahead.points,
+        tuple((i, b) for i, b in first.special if i < keep)
+        + tuple((i + keep, b) for i, b in ahead.special if not (common and i == 0)),
+    )
+    if strand.points[0].spot.parameter > strand.points[-1].spot.parameter:
         strand, ends = strand.reversed(), ends[::-1]
-    spots = [spot for spot, _ in strand.spots]
+    spots = [point.spot for point in strand.points]
     unravel = jfu.ravel_pytree(curve.like)[1]
 
     def column(rows: list[np.ndarray]) -> Any:
@@ -148,7 +192,7 @@ def orbit_branch(
         parameter=parameter,
         values=np.array([spot.parameter for spot in spots]),
         periods=np.array([float(spot.look.period) for spot in spots]),
-        orders=np.array([order for _, order in strand.spots]),
+        orders=np.array([point.order for point in strand.points]),
         ts=np.array([t for t, _, _ in bases]),
         ys=column([x for _, x, _ in bases]),
         low=column([spot.look.low for spot in spots]),

@@ -28,7 +28,6 @@ class Half:
     side: int
     cycle: Cycle | None = None
     partner: "Half | None" = None
-    used: bool = False
 
     @property
     def multipliers(self) -> np.ndarray:

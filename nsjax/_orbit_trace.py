@@ -1,7 +1,7 @@
 """Along a branch of periodic orbits in one course, to the next point at which others may meet it."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -140,24 +140,46 @@ class Zero(NamedTuple):
     side: int = 0
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(frozen=True)
 class Arc:
-    """Points one after the other, up to one at which the course ends, and the bifurcations passed on the way."""
+    """Points one after the other, up to one at which the course ends. It is a value, from which `OrbitTracer.further`
+    makes the next.
 
-    spots: list[Spot]
-    passed: list[tuple[int, Zero]] = dataclasses.field(default_factory=list)
-    end: Zero | None = None
+    - `spots`: the points.
+    - `begin`: a point at which it has been all round.
+    - `length`, `steps`: of the next step; how many there were.
+    - `ahead`: points that the last step found, and that are to come: zeros, and where it ends.
+    - `at`: what vanishes at the last point.
+    - `why`, `closed`: why there is no other; whether because it has been all round.
+    """
+
+    spots: tuple[Spot, ...]
+    begin: Spot | None = None
+    length: float = FIRST
+    steps: int = 0
+    ahead: tuple[Spot | Zero, ...] = ()
+    at: Zero | None = None
     why: str = ""
     closed: bool = False
+
+    @property
+    def end(self) -> Zero | None:
+        """That with which the course ends."""
+        return None if self.at is None or self.at.test.kind in PASSED else self.at
+
+    @property
+    def over(self) -> bool:
+        return not self.ahead and bool(self.end or self.closed or self.why)
 
 
 @dataclasses.dataclass
 class OrbitTracer:
-    """Traces arcs."""
+    """Traces arcs; virtual ones heed nothing but the ends of the interval."""
 
     curve: OrbitCurve
     max_step: float
     max_points: int
+    virtual: bool = False
 
     def at(self, spot: Spot, s: float, guess: Any = None) -> Spot | None:
         """The point at the distance `s` along the tangent of another."""
@@ -194,43 +216,42 @@ class OrbitTracer:
         found = advance(self.curve, course, guess, border, np.zeros(()), guess, np.asarray(True))
         return spot_of(self.curve, found, course) if bool(found.good) else None
 
-    def arc(self, out: Arc, begin: Spot | None = None) -> Iterator[Spot]:
-        """Follows the branch along the tangent at the last point of `out`, to which it adds, point by point. `begin`: a
-        point at which it has been all round."""
-        length, spot, steps = FIRST, out.spots[-1], 0
-        while len(out.spots) < self.max_points:
+    def further(self, arc: Arc) -> Arc:
+        """The arc with one point more, or with the reason why there is none."""
+        if not arc.ahead:
+            arc = self.stepped(arc)
+        if not arc.ahead:
+            return arc
+        here, *ahead = arc.ahead
+        zero = here if isinstance(here, Zero) else None
+        spot = here.spot if isinstance(here, Zero) else here
+        return dataclasses.replace(arc, spots=(*arc.spots, spot), ahead=tuple(ahead), at=zero)
+
+    def stepped(self, arc: Arc) -> Arc:
+        """The next step along the tangent at the last point, as long as it can be."""
+        spot, length = arc.spots[-1], arc.length
+        if len(arc.spots) >= self.max_points:
+            return dataclasses.replace(arc, why=f"max_points = {self.max_points}, at {spot.parameter:.10g}")
+        while True:
             step = self.at(spot, length)
             turn = np.inf
             if step is not None:
                 turn = float(np.arccos(np.clip(float(spot.look.tangent @ step.look.tangent), -1, 1)))
             zeros = self.zeros(spot, step, length) if step is not None and turn <= 0.5 else None
-            if step is None or zeros is None:
-                length /= 2
-                if length < SHORTEST:
-                    out.why = f"the last orbit that could be found, at {spot.parameter:.10g}"
-                    return
-                continue
-            for zero in zeros:
-                if zero.test.kind == "Neimark-Sacker" and not _complex_pair(zero.spot):
-                    continue
-                out.spots.append(zero.spot)
-                if zero.test.kind not in PASSED:
-                    out.end = zero
-                    yield zero.spot
-                    return
-                out.passed.append((len(out.spots) - 1, zero))
-                yield zero.spot
-            steps += 1
-            if begin is not None and steps > 3 and self.passes(begin, spot, step):
-                out.spots.append(begin)
-                out.closed = True
-                return
-            spot = step
-            out.spots.append(spot)
-            yield spot
-            speed = float(np.max(np.abs(spot.look.tangent) / np.maximum(1, np.abs(spot.look.u))))
-            length = min(self.max_step / speed, length * float(np.clip(TURN / max(turn, 1e-9), 0.5, 2)))
-        out.why = f"max_points = {self.max_points}, at {spot.parameter:.10g}"
+            if step is not None and zeros is not None:
+                break
+            length /= 2
+            if length < SHORTEST:
+                return dataclasses.replace(arc, why=f"the last orbit that could be found, at {spot.parameter:.10g}")
+        zeros = tuple(z for z in zeros if z.test.kind != "Neimark-Sacker" or _complex_pair(z.spot))
+        if zeros and zeros[-1].test.kind not in PASSED:
+            return dataclasses.replace(arc, ahead=zeros)
+        steps = arc.steps + 1
+        if arc.begin is not None and steps > 3 and self.passes(arc.begin, spot, step):
+            return dataclasses.replace(arc, ahead=(*zeros, arc.begin), closed=True)
+        speed = float(np.max(np.abs(step.look.tangent) / np.maximum(1, np.abs(step.look.u))))
+        length = min(self.max_step / speed, length * float(np.clip(TURN / max(turn, 1e-9), 0.5, 2)))
+        return dataclasses.replace(arc, ahead=(*zeros, step), length=length, steps=steps)
 
     def passes(self, begin: Spot, spot: Spot, step: Spot) -> bool:
         """Whether another orbit lies on the curve between two points."""
@@ -250,6 +271,8 @@ class OrbitTracer:
         changed = []
         for test, value in before.items():
             if test not in after or after[test] == 0 or value * after[test] > 0:
+                continue
+            if self.virtual and test.kind not in ("low", "high"):
                 continue
             if test.kind in (*CORNERS, "low", "high") and after[test] > 0:
                 continue  # it comes from where it could not be: a start on the point itself
