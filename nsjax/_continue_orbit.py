@@ -1,5 +1,6 @@
 """The continuation of periodic orbits over a parameter, through folds and corners, along every branch."""
 
+import contextlib
 import dataclasses
 import os
 import warnings
@@ -19,9 +20,11 @@ from ._orbit import Orbit
 from ._orbit_branch import orbit_branch, OrbitBranch, OrbitStrand, Point, TYPES as OF_BRANCHES
 from ._orbit_curve import guard_sizes, Look, OrbitCurve
 from ._orbit_node import Half, itinerary, Node
+from ._orbit_record import Measures, Recorder
 from ._orbit_trace import Arc, OrbitTracer, Spot, Test, Zero
-from ._orbit_tree import OrbitExplorer, OrbitTree, Walk
+from ._orbit_tree import Exit, OrbitExplorer, OrbitTree, Walk
 from ._parameter import get_parameter, parameter_path
+from ._progress import ProgressLine
 from ._segment_flow import exactness
 from ._solution import is_okay
 from ._system import arrays_of, System
@@ -31,7 +34,7 @@ from ._types import Y
 GIVEN = ("model", "path", "like", "how")  # what of a curve follows from the model, and is not saved
 TYPES = {
     **OF_BRANCHES,
-    **table(OrbitTree, Walk, Arc, Zero, Test, Spot, Look, Course, Node, Half, Cycle, OrbitStrand, Point),
+    **table(OrbitTree, Walk, Exit, Arc, Zero, Test, Spot, Look, Course, Node, Half, Cycle, OrbitStrand, Point),
 }
 
 
@@ -46,6 +49,9 @@ def continue_orbit(
     max_points: int = 1000,
     max_branches: int = 20,
     max_laps: int = 4,
+    virtual: bool = False,
+    record: Measures | None = None,
+    progress: bool = False,
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     max_steps: int = 4096,
@@ -77,21 +83,43 @@ def continue_orbit(
     - `max_points`: of each arc between two special points.
     - `max_branches`: so many at most; if there are more a warning says so.
     - `max_laps`: the longest period that is followed, over that of `orbit`.
+    - `virtual`: whether to follow the segments of the orbits at each corner beyond it too, though the system has no
+        such orbits there (to see what a corner cuts off, or Feigin's classification): as branches of their own in
+        `OrbitBranch.others`, with `OrbitBranch.admissible` false.
+    - `record`: measures of each orbit for `OrbitBranch.records`: functions, by name, of times along one period, shape
+        `(samples,)`, and of the states there, leaves with the same leading axis; NumPy arrays. They return a number, or
+        an array of one shape. The samples of each segment between two events lie closer towards its ends (Chebyshev
+        points, both ends included: there is one before and one after each event): weigh them by their distances, as
+        the trapezoid rule does.
+
+        ```python
+        def power(ts, ys):  # the mean of what is dissipated in c = 0.2
+            return np.trapezoid(0.2 * ys.v**2, ts) / (ts[-1] - ts[0])
+
+        def sticking(ts, ys):  # for how long
+            return np.sum(np.diff(ts)[np.abs(ys.v - 0.5)[1:] < 1e-9])
+
+        branch = nsjax.continue_orbit(system, orbit, "omega", (0.5, 2.0), record={"P": power, "stick": sticking})
+        nsjax.plot.orbit_diagram(branch, "P")
+        ```
+    - `progress`: whether to write to the standard error stream how far it is.
     - `solver`, `stepsize_controller`, `max_steps`: as for `solve`, of each segment; by default Dopri8 with tolerances
         of 1e-12.
 
     **Returns:** the `OrbitBranch` through `orbit`, with the others in `OrbitBranch.others`.
 
     **Raises:** `ValueError` for an unknown parameter, a value outside the interval, an orbit that was not found or is
-    not admissible, and in single precision.
+    not admissible, a function of `record` that fails or gives arrays of different shapes, and in single precision.
     """
     growth = OrbitGrowth(
         system, orbit, parameter, interval, scale=scale, max_step=max_step, max_points=max_points,
-        max_branches=max_branches, max_laps=max_laps, solver=solver, stepsize_controller=stepsize_controller,
-        max_steps=max_steps,
+        max_branches=max_branches, max_laps=max_laps, virtual=virtual, record=record, solver=solver,
+        stepsize_controller=stepsize_controller, max_steps=max_steps,
     )  # fmt: skip
-    for _ in growth:
-        pass
+    with ProgressLine() if progress else contextlib.nullcontext() as line:
+        for _ in growth:
+            if line is not None:
+                line.show(growth)
     return growth.branch
 
 
@@ -103,12 +131,14 @@ class OrbitGrowth:
     for point in tqdm(growth):
         if point.parameter > 1.9:
             break
+    print(growth)  # how far it is
     print(growth.branch)  # what there is so far; go on iterating for more
     growth.save("growth.npz")
     growth = nsjax.OrbitGrowth.load("growth.npz", system)  # some other day
     ```
 
-    An interrupt (Ctrl-C), wherever it comes, leaves a growth that can be gone on with. The arguments are those of `continue_orbit`.
+    An interrupt (Ctrl-C), wherever it comes, leaves a growth that can be gone on with. The arguments are those of
+    `continue_orbit`, but for `progress`.
     """
 
     def __init__(
@@ -123,6 +153,8 @@ class OrbitGrowth:
         max_points: int = 1000,
         max_branches: int = 20,
         max_laps: int = 4,
+        virtual: bool = False,
+        record: Measures | None = None,
         solver: dfx.AbstractSolver = dfx.Dopri8(),
         stepsize_controller: dfx.AbstractStepSizeController | None = None,
         max_steps: int = 4096,
@@ -182,7 +214,9 @@ class OrbitGrowth:
         spot = tracer.corrected(start.course, np.asarray(curve.pack(start, value)))
         if spot is None:
             raise ValueError("Argument `orbit` must be an orbit of `system`, but none was found next to it.")
-        self._explorer = OrbitExplorer(tracer, parameter, max_branches, max_laps * order)
+        self._explorer = OrbitExplorer(
+            tracer, parameter, max_branches, max_laps * order, Recorder(record or {}), virtual
+        )
         self._tree = self._explorer.planted(spot)
 
     def __iter__(self) -> "OrbitGrowth":
@@ -206,6 +240,15 @@ class OrbitGrowth:
         found = [orbit_branch(curve, curve.model.system, name, *pair, itinerary) for pair in self._tree.branches]
         return dataclasses.replace(found[0], others=tuple(found[1:]))
 
+    def __str__(self) -> str:
+        strands = [strand for pair in self._tree.branches for strand in pair]
+        special = {id(found) for strand in strands for _, found in strand.special}
+        value = next(strand.points[-1].spot.parameter for strand in self._tree.branches[-1] if strand.points)
+        return (
+            f"branch {len(self._tree.branches)}, {sum(len(strand.points) for strand in strands)} points, "
+            f"{self._explorer.name} = {value:.6g}, {len(special)} special points"
+        )
+
     def save(self, path: str | os.PathLike) -> None:
         """Writes all that is known so far to a file, an `.npz` of plain arrays with a description in JSON: at any time,
         also after an interrupt."""
@@ -215,7 +258,8 @@ class OrbitGrowth:
             curve={f.name: getattr(curve, f.name) for f in dataclasses.fields(curve) if f.name not in GIVEN},
             t0=self._tree.start.look.begin[0],
             tracer=dict(max_step=explorer.tracer.max_step, max_points=explorer.tracer.max_points),
-            explorer=dict(name=explorer.name, max_branches=explorer.max_branches, max_order=explorer.max_order),
+            record=sorted(explorer.recorder.measures),
+            explorer={name: getattr(explorer, name) for name in ("name", "max_branches", "max_order", "virtual")},
             tree=self._tree,
         )
         save(path, "OrbitGrowth", TYPES, curve.model.system, curve.like, parts, curve=curve)
@@ -227,6 +271,7 @@ class OrbitGrowth:
         system: System,
         y: Y | None = None,
         *,
+        record: Measures | None = None,
         solver: dfx.AbstractSolver = dfx.Dopri8(),
         stepsize_controller: dfx.AbstractStepSizeController | None = None,
         max_steps: int = 4096,
@@ -239,9 +284,10 @@ class OrbitGrowth:
         - `system`: a model of the same class and shapes; the values of its parameters are taken from the file.
         - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
             NamedTuples.
-        - `solver`, `stepsize_controller`, `max_steps`: those with which it was begun.
+        - `record`, `solver`, `stepsize_controller`, `max_steps`: those with which it was begun.
 
-        **Raises:** `ValueError` for a file that is damaged, is none of `save`'s, or is of another model or solver.
+        **Raises:** `ValueError` for a file that is damaged, is none of `save`'s, or is of another model or solver,
+        or has other records.
         """
         archive = Archive(path, "OrbitGrowth", TYPES, system, y)
         how = _how(solver, stepsize_controller, max_steps)
@@ -249,6 +295,12 @@ class OrbitGrowth:
             raise ValueError(
                 "Arguments `solver`, `stepsize_controller` and `max_steps` must be those with which the branch was "
                 f"begun, {archive.part('how')}, but are {plain(repr(how))}."
+            )
+        recorder = Recorder(record or {})
+        if sorted(recorder.measures) != archive.part("record"):
+            raise ValueError(
+                "Argument `record` must hold functions of the names with which the branch was begun, "
+                f"{archive.part('record')}, but has {sorted(recorder.measures)}."
             )
         given = archive.part("explorer")
         curve = OrbitCurve(
@@ -259,8 +311,10 @@ class OrbitGrowth:
             **archive.part("curve"),
         )
         growth = cls.__new__(cls)
-        growth._explorer = OrbitExplorer(OrbitTracer(curve, **archive.part("tracer")), **given)
+        growth._explorer = OrbitExplorer(OrbitTracer(curve, **archive.part("tracer")), **given, recorder=recorder)
         growth._tree = archive.part("tree", curve=curve)
+        for name, value in growth._tree.branches[0][1].points[0].record.items():
+            recorder.shapes[name] = value.shape
         return growth
 
 

@@ -7,14 +7,20 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.flatten_util as jfu
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from ._archive import Archive, save, table
+from ._course import FREE, LEAST, TIME
+from ._cuts import Segment
+from ._find_orbit import find_orbit
+from ._orbit import Orbit
 from ._orbit_bifurcation import OrbitBifurcation, OrbitHalf
 from ._orbit_curve import OrbitCurve
+from ._orbit_record import states_of
 from ._orbit_trace import midpoint, Spot
+from ._parameter import parameter_path, put_parameter
 from ._pencil import EigenvalueCrossing
 from ._system import System
 from ._types import Y
@@ -37,7 +43,11 @@ class OrbitBranch(eqx.Module):
     - `low`, `high`, `mean`: of each component of the state along the orbit, in the structure of `ys`.
     - `multipliers`: shape `(points, n)`, largest modulus first; infinite on orbits that are infinitely unstable.
     - `stable`: whether all but the trivial one are inside the unit circle.
+    - `admissible`: whether they are orbits of the system: false along a virtual branch, on which the segments of the
+        orbits at a corner are followed beyond it, whatever surfaces they pass, or with a negative duration.
     - `itineraries`: the modes that each orbit passes through, as text.
+    - `segments`: of each orbit, from its time in `ts` on: a guess for `find_orbit`.
+    - `records`: what the functions `record` of `continue_orbit` gave, by name; arrays with a leading axis.
     - `special`: the special points on it, in their order.
     - `indices`: at which point of the branch each is. A corner is there with the limits of its multipliers from both
         sides, at `indices` and the point after.
@@ -57,7 +67,10 @@ class OrbitBranch(eqx.Module):
     mean: Y
     multipliers: Complex[np.ndarray, "points n"]
     stable: Bool[np.ndarray, " points"]
+    admissible: Bool[np.ndarray, " points"]
     itineraries: tuple[str, ...]
+    segments: tuple[tuple[Segment, ...], ...]
+    records: dict[str, np.ndarray]
     special: tuple[OrbitBifurcation, ...]
     indices: tuple[int, ...]
     ends: tuple[str, str]
@@ -80,6 +93,29 @@ class OrbitBranch(eqx.Module):
     def bifurcations(self) -> tuple[OrbitBifurcation, ...]:
         """Those of them that are bifurcations."""
         return tuple(b for b in self.special_points if b.kind not in NOT_BIFURCATIONS)
+
+    def system_at(self, index: int) -> System:
+        """The model with the parameter's value at a point."""
+        path = parameter_path(self.system, self.parameter)
+        return put_parameter(self.system, path, jnp.asarray(self.values[index]))
+
+    def orbit(self, index: int, **options: Any) -> Orbit:
+        """The orbit at a point of the branch, for all that can be done with an `Orbit`.
+
+        **Arguments:**
+
+        - `index`: which point.
+        - `options`: for `find_orbit`. The orbit is found in segments, however unstable it is, which is a program for
+            each number of them; with `method="shooting"`, for orbits that are not very unstable, it is one for all.
+
+        **Returns:** the `Orbit`, of `system_at(index)`. On a virtual branch it is not admissible.
+        """
+        system, t0 = self.system_at(index), self.ts[index]
+        guess: dict[str, Any] = dict(segments=self.segments[index])
+        if options.get("method") == "shooting":
+            guess = dict(period=self.periods[index]) if system.period is None else {}
+        y0 = jax.tree.map(lambda x: jnp.asarray(x[index]), self.ys)
+        return find_orbit(system, y0, t0=t0, order=int(self.orders[index]), **guess, **options)
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes the branch and the others to a file, an `.npz` of plain arrays with a description in JSON."""
@@ -104,12 +140,15 @@ class OrbitBranch(eqx.Module):
         return len(self.values)
 
     def __str__(self) -> str:
-        lines = [f"{len(self.branches)} {'branches' if self.others else 'branch'} of periodic orbits of "
-                 f"{type(self.system).__name__}"]  # fmt: skip
+        count = sum(bool(branch.admissible.any()) for branch in self.branches)
+        virtual = f", {len(self.branches) - count} virtual" if count < len(self.branches) else ""
+        owner = type(self.system).__name__
+        lines = [f"{count} {'branch' if count == 1 else 'branches'} of periodic orbits of {owner}{virtual}"]
         seen: list[Any] = []
         for branch in self.branches:
             low, high = float(np.min(branch.values)), float(np.max(branch.values))
             words = ["stable" if s else "unstable" for s in branch.stable]
+            words = [word if real else "virtual" for word, real in zip(words, branch.admissible)]
             runs = [word for i, word in enumerate(words) if i == 0 or words[i - 1] != word]
             told = ", then ".join(runs) if len(runs) <= 6 else f"{len(runs) - 1} changes of stability"
             order = int(branch.orders[0])
@@ -123,14 +162,17 @@ class OrbitBranch(eqx.Module):
         return "\n".join(lines)
 
 
-TYPES = table(OrbitBranch, OrbitBifurcation, OrbitHalf, EigenvalueCrossing)
+TYPES = table(OrbitBranch, OrbitBifurcation, OrbitHalf, EigenvalueCrossing, Segment)
 
 
 class Point(NamedTuple):
-    """A point of a strand, and of how many periods of the forcing its orbits are."""
+    """A point of a strand, of how many periods of the forcing its orbit is, the user's measures of it, and whether the
+    system has such an orbit."""
 
     spot: Spot
     order: int
+    record: dict[str, np.ndarray]
+    admissible: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +208,8 @@ class OrbitStrand:
 def orbit_branch(
     curve: OrbitCurve, system: System, parameter: str, back: OrbitStrand, ahead: OrbitStrand, itinerary: Any
 ) -> OrbitBranch:
-    """Two strands that set out from one point as one branch: upwards, if there is a choice."""
+    """Two strands that set out from one point as one branch: upwards, if there is a choice; a virtual one, away from
+    where it begins."""
     ends = (back.end, ahead.end)
     first, keep = back.reversed(), len(back.points)
     common = bool(first.special and ahead.special) and first.special[-1][1] is ahead.special[0][1]
@@ -177,13 +220,13 @@ def orbit_branch(
         tuple((i, b) for i, b in first.special if i < keep)
         + tuple((i + keep, b) for i, b in ahead.special if not (common and i == 0)),
     )
-    if strand.points[0].spot.parameter > strand.points[-1].spot.parameter:
+    start, stop = strand.points[0], strand.points[-1]
+    if start.admissible and start.spot.parameter > stop.spot.parameter:
         strand, ends = strand.reversed(), ends[::-1]
     spots = [point.spot for point in strand.points]
-    unravel = jfu.ravel_pytree(curve.like)[1]
 
     def column(rows: list[np.ndarray]) -> Any:
-        return jax.tree.map(np.asarray, jax.vmap(unravel)(np.stack(rows)))
+        return states_of(curve.like, np.stack(rows))
 
     bases = [midpoint(curve, spot, spot.course.rows) for spot in spots]
     texts: dict[int, str] = {}
@@ -200,8 +243,31 @@ def orbit_branch(
         mean=column([spot.look.mean for spot in spots]),
         multipliers=np.stack([np.asarray(spot.multipliers, complex) for spot in spots]),
         stable=np.array([spot.stable for spot in spots]),
+        admissible=np.array([point.admissible for point in strand.points]),
+        segments=tuple(segments_of(curve, spot, t) for spot, (t, _, _) in zip(spots, bases)),
         itineraries=tuple(texts.setdefault(id(s.course), itinerary(curve, s.course)) for s in spots),
+        records={name: np.stack([point.record[name] for point in strand.points]) for name in strand.points[0].record},
         special=tuple(b for _, b in strand.special),
         indices=tuple(i for i, _ in strand.special),
         ends=ends,
     )
+
+
+def segments_of(curve: OrbitCurve, spot: Spot, t: float) -> tuple[Segment, ...]:
+    """The segments of an orbit from a time within one of them on; that one comes first and last."""
+    look, course, model = spot.look, spot.course, curve.model
+    modes = [tuple(course.mode[i].tolist()) for i in course.rows]
+    lengths = [float(look.end[i] - look.begin[i]) for i in course.rows]
+    if course.ends[0] == TIME:
+        return (Segment(modes[0], lengths[0]),)
+    middles = (look.begin + look.end)[: len(modes)] / 2
+    first = int(np.argmin(np.abs(middles - t)))
+    out, duration = [], float(look.end[first] - t)
+    for i in [*range(first, len(modes)), *range(first)]:
+        if i != first:
+            duration += lengths[i]
+        if course.ends[i] != LEAST:  # a cut that changes nothing
+            switch = model.switches[model.slots[int(course.slot[i])].switch].name
+            out.append(Segment(modes[i], duration, switch, bool(course.ends[i] == FREE)))
+            duration = 0.0
+    return (*out, Segment(modes[first], duration + float(t - look.begin[first])))

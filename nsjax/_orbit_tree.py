@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,11 +11,22 @@ from ._orbit_branch import CLOSED, OrbitStrand, Point
 from ._orbit_corner import node_at
 from ._orbit_curve import OrbitCurve
 from ._orbit_grazing import grazing_at
-from ._orbit_node import Half, Node, tracer_for
-from ._orbit_trace import alike, Arc, OrbitTracer, PASSED, SAME, Spot, turned
+from ._orbit_node import admissible, Half, Node, tracer_for
+from ._orbit_record import Recorder
+from ._orbit_trace import alike, Arc, CORNERS, OrbitTracer, PASSED, SAME, Spot, turned
 
 
+NEARBY = 10  # points to a corner from where a half-branch was entered
 Place = tuple[int, int]  # of a half-branch: the number of its node, and its own
+
+
+class Exit(NamedTuple):
+    """Where a course ends at a corner, `corner`, and virtual orbits go on: at `spot`, the same in that course."""
+
+    name: str
+    curve: OrbitCurve
+    corner: Spot
+    spot: Spot
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,12 +36,14 @@ class Walk:
     - `arc`: the last arc of the strand, on a `curve`.
     - `origin`: the half-branch on which the branch set out; None for the start.
     - `back`: whether it is the first strand.
+    - `virtual`: whether it goes on where its orbits are none.
     """
 
     curve: OrbitCurve
     arc: Arc
     origin: Place | None = None
     back: bool = False
+    virtual: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +54,7 @@ class OrbitTree:
     - `start`: the orbit on which all began.
     - `branches`: two strands each, which set out from one point.
     - `nodes`: the points at which half-branches meet, and which of these were `used`: set out upon, or arrived on.
+    - `exits`: where virtual branches are to begin.
     - `walk`: what is under way; None when all is done.
     """
 
@@ -48,6 +63,7 @@ class OrbitTree:
     walk: Walk | None
     nodes: tuple[Node, ...] = ()
     used: tuple[Place, ...] = ()
+    exits: tuple[Exit, ...] = ()
 
     @property
     def strand(self) -> OrbitStrand:
@@ -87,6 +103,8 @@ class OrbitExplorer:
     name: str  # of the parameter
     max_branches: int
     max_order: int
+    recorder: Recorder
+    virtual: bool
 
     def planted(self, spot: Spot) -> OrbitTree:
         """Nothing but a first orbit."""
@@ -101,20 +119,20 @@ class OrbitExplorer:
         assert walk is not None
         if walk.arc.over:
             return self.turn(tree, walk), None
-        tracer = tracer_for(self.tracer, walk.curve)
+        tracer = dataclasses.replace(tracer_for(self.tracer, walk.curve), virtual=walk.virtual)
         arc = tracer.further(walk.arc)
         tree = dataclasses.replace(tree, walk=dataclasses.replace(walk, arc=arc))
         if len(arc.spots) == len(walk.arc.spots):
             return tree, None
         spot = arc.spots[-1]
-        strand = tree.strand.then(self.point(spot, walk.curve))
+        strand = tree.strand.then(self.point(spot, walk.curve, not walk.virtual or admissible(walk.curve, spot)))
         if arc.at is not None and arc.at.test.kind in PASSED:
             tree, made = self.passed(tree, tracer, arc)
             strand = strand if made is None else strand.noting(made)
         return tree.growing(strand), spot
 
-    def point(self, spot: Spot, curve: OrbitCurve) -> Point:
-        return Point(spot, int(curve.order))
+    def point(self, spot: Spot, curve: OrbitCurve, admissible: bool = True) -> Point:
+        return Point(spot, int(curve.order), self.recorder(curve, spot), admissible)
 
     def passed(self, tree: OrbitTree, tracer: OrbitTracer, arc: Arc) -> tuple[OrbitTree, OrbitBifurcation | None]:
         """A bifurcation through which the branch goes on as it is."""
@@ -147,9 +165,12 @@ class OrbitExplorer:
             node = node_at(tracer, self.name, zero, max(1, self.max_order // order))
             if node is None:
                 tree = tree.growing(tree.strand.ending(self.point(zero.spot, walk.curve)))
-                return self.ended(tree, f"{zero.test.kind} at {self.name} = {zero.spot.parameter:.10g}")
+                why = f"{zero.test.kind} at {self.name} = {zero.spot.parameter:.10g}"
+                return self.ended(self.left(tree, Exit(why, walk.curve, zero.spot, outwards(arc))), why)
             tree = dataclasses.replace(tree, nodes=(*tree.nodes, node))
         node = tree.nodes[at]
+        if node.bifurcation.discontinuous:
+            tree = self.left(tree, Exit(self.named(node), walk.curve, zero.spot, outwards(arc)))
         arrived = self.arrived(tracer, node, arc)
         last = dataclasses.replace(zero.spot, stable=tree.strand.points[-2].spot.stable)
         ahead = None
@@ -174,6 +195,9 @@ class OrbitExplorer:
             strand = strand.noting(node.bifurcation)
         strand = strand.then(self.point(half.spot, half.curve))
         walk = dataclasses.replace(walk, curve=half.curve, arc=Arc((half.spot,), begin=begin))
+        if node.bifurcation.discontinuous and self.virtual:
+            behind = self.behind(node, half)
+            tree = tree if behind is None else self.left(tree, Exit(self.named(node), half.curve, node.spot, behind))
         return dataclasses.replace(tree.growing(strand), walk=walk, used=(*tree.used, place))
 
     def ended(self, tree: OrbitTree, why: str) -> OrbitTree:
@@ -181,6 +205,8 @@ class OrbitExplorer:
         walk = tree.walk
         assert walk is not None
         tree = tree.growing(dataclasses.replace(tree.strand, end=why))
+        if walk.virtual:
+            return self.escaped(tree)
         if not walk.back and walk.origin is None and why != CLOSED:
             spot = turned(tree.start)
             walk = Walk(self.tracer.curve, Arc((spot,), begin=spot), back=True)
@@ -193,10 +219,34 @@ class OrbitExplorer:
                 return self.departed(tree.growing(OrbitStrand()), partner)
         place = next(tree.places(), None)
         if place is None or len(tree.branches) >= self.max_branches:
-            return dataclasses.replace(tree, walk=None)
+            return self.escaped(tree)
         new = OrbitStrand(end=self.named(tree.nodes[place[0]])), OrbitStrand()
         walk = dataclasses.replace(walk, origin=place, back=False)
         return self.departed(dataclasses.replace(tree, branches=(*tree.branches, new), walk=walk), place)
+
+    def left(self, tree: OrbitTree, exit: Exit) -> OrbitTree:
+        """A course, at a corner: if virtual orbits are asked for."""
+        return dataclasses.replace(tree, exits=(*tree.exits, exit)) if self.virtual else tree
+
+    def behind(self, node: Node, half: Half) -> Spot | None:
+        """A corner in the course of a half-branch that leaves it, looking the other way."""
+        tracer, arc = tracer_for(self.tracer, half.curve), Arc((turned(half.spot),))
+        while not arc.over and len(arc.spots) < NEARBY:
+            arc = tracer.further(arc)
+        zero = arc.end
+        if zero is None or zero.test.kind not in CORNERS:
+            return None
+        found = (grazing_at(tracer, zero) or zero) if zero.test.kind == "guard" else zero
+        return outwards(arc) if node.is_at(found.spot, half.curve) else None
+
+    def escaped(self, tree: OrbitTree) -> OrbitTree:
+        """When all else is done: beyond a corner, in the course that ends there."""
+        if not tree.exits:
+            return dataclasses.replace(tree, walk=None)
+        exit, *others = tree.exits
+        new = OrbitStrand(end=exit.name), OrbitStrand((self.point(exit.corner, exit.curve, False),))
+        walk = Walk(exit.curve, Arc((exit.spot,)), virtual=True)
+        return dataclasses.replace(tree, branches=(*tree.branches, new), exits=tuple(others), walk=walk)
 
     def arrived(self, tracer: OrbitTracer, node: Node, arc: Arc) -> int | None:
         """On which half-branch the branch came: that which has the same orbit at the same parameter."""
@@ -227,3 +277,11 @@ class OrbitExplorer:
 
     def named(self, node: Node) -> str:
         return f"{node.bifurcation.name} at {self.name} = {node.bifurcation.value:.6g}"
+
+
+def outwards(arc: Arc) -> Spot:
+    """The last point of an arc, with the way that the arc came for its tangent: at a corner that touches at several
+    places at once the equations are singular, a segment of no length at each going its own way."""
+    before, at = arc.spots[-2:]
+    chord = at.look.u - before.look.u
+    return dataclasses.replace(at, look=at.look._replace(tangent=chord / np.linalg.norm(chord)))

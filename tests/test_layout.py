@@ -14,6 +14,7 @@ PACKAGE = pathlib.Path(__file__).parents[1] / "nsjax"
 ORDER = (
     "_types",
     "_once",
+    "_progress",
     "_linear",
     "_structure",
     "_system",
@@ -82,6 +83,7 @@ ORDER = (
     "_orbit_grazing",
     "_orbit_half",
     "_orbit_corner",
+    "_orbit_record",
     "_orbit_branch",
     "_orbit_tree",
     "_continue_orbit",

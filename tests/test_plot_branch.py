@@ -43,7 +43,8 @@ def branch_of(system, parameter, values, heights, multipliers, special=(), indic
         ts=np.zeros(n), ys=gallery.Motion(0.5 * heights, np.zeros(n)), low=gallery.Motion(-heights, -2 * heights),
         high=gallery.Motion(0.5 * heights, heights), mean=gallery.Motion(np.zeros(n), np.zeros(n)),
         multipliers=multipliers, stable=np.all(moduli <= 1, axis=1), itineraries=("",) * n, special=tuple(special),
-        indices=tuple(indices), ends=("", ""), others=tuple(others),
+        indices=tuple(indices), ends=("", ""), others=tuple(others), admissible=np.ones(n, bool),
+        segments=((),) * n, records={"top": heights, "rows": np.zeros((n, 2))},
     )  # fmt: skip
 
 

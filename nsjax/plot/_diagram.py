@@ -20,7 +20,8 @@ WAYS = ((1, -1), (1, 1), (-1, 1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1))  #
 def stretches(
     ax: "Axes", x: np.ndarray, y: np.ndarray, kinds: np.ndarray, styles: Mapping[Any, Any], style: dict[str, Any]
 ) -> None:
-    """Lines, each of one kind from end to end, in the line style and with the label `styles[kind]`. A change between
+    """Lines, each of one kind from end to end, in the line style, with the label, and perhaps further style, that
+    `styles[kind]` says. A change between
     two points is at the first of them, where these are one corner seen from both sides, and at the second, where that
     is the special point."""
     start = 0
@@ -28,8 +29,9 @@ def stretches(
         if end < len(x) and kinds[end] == kinds[start]:
             continue
         last = min(end + 1, len(x))
-        linestyle, label = styles[kinds[start]]
-        ax.plot(x[start:last], y[start:last], zorder=2, linestyle=linestyle, label=label, **style)
+        linestyle, label, *more = styles[kinds[start]]
+        own = dict(style, zorder=2, linestyle=linestyle, label=label) | dict(*more)
+        ax.plot(x[start:last], y[start:last], **own)
         start = end
 
 

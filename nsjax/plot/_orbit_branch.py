@@ -28,6 +28,7 @@ STYLES = {
     0: ("-", "stable periodic orbit"),
     1: (UNSTABLE, "unstable periodic orbit"),
     2: ((0, (1, 1)), "infinitely unstable periodic orbit"),
+    3: (":", "virtual", dict(color="0.6", linewidth=0.9, zorder=1)),
 }
 PARTS: dict[str, tuple[Callable[[Any], Any], str]] = {"abs": (np.abs, "|λ| [-]"), "real": (np.real, "Re λ [-]")}
 PATH = dict(color="C3", linestyle=":", linewidth=1.4, zorder=3)
@@ -52,15 +53,16 @@ def orbit_diagram(
     legend: bool = True,
 ) -> "Axes":
     """Draws branches of periodic orbits over the parameter, stable ones solid, unstable ones dashed, infinitely
-    unstable ones dotted, with their special points: red where multipliers jump through the unit circle, blue where they
-    pass it smoothly, hollow where nothing bifurcates; Figs. 6.12, 6.15, 6.18, 6.20 and 6.21.
+    unstable ones dotted, virtual ones thin and grey, with their special points: red where multipliers jump through the
+    unit circle, blue where they pass it smoothly, hollow where nothing bifurcates; Figs. 6.12, 6.15, 6.18, 6.20 and
+    6.21.
 
     **Arguments:**
 
     - `branch`: from `continue_orbit`; its other branches are drawn too.
-    - `measure`: what stands for an orbit: the name of a component of the state, for its amplitude max |x|; or a
-        function of a branch that gives a number for each of its points, as `lambda b: b.periods` or
-        `lambda b: b.high.x - b.low.x`. By default the amplitude of the first component.
+    - `measure`: what stands for an orbit: the name of a component of the state, for its amplitude max |x|; the name of
+        one of the `records`, of numbers; or a function of a branch that gives a number for each of its points, as
+        `lambda b: b.periods` or `lambda b: b.high.x - b.low.x`. By default the amplitude of the first component.
     - `names`: whether to write what the special points are; or a function of an `OrbitBifurcation` that gives the
         words, none if empty.
     - `ax`: where to draw; by default a new figure.
@@ -69,7 +71,7 @@ def orbit_diagram(
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` for an unknown component, or a function that does not give one number for each point.
+    **Raises:** `ValueError` for an unknown component, or a record or function that is not one number for each point.
     """
     ax = axes_or_new(ax)
     heights = [_measured(measure, one) for one in branch.branches]
@@ -102,7 +104,8 @@ def multiplier_diagram(
     unstable ones dashed. Where they jump, the path of the set-valued ones (6.13) is dotted: the eigenvalues of
     (1 - q) M₁ + q M₂ at that value of the parameter; Figs. 6.13, 6.19 and 6.22.
 
-    The multiplier 1 that an autonomous system always has is left out. Infinite ones lie on the upper edge.
+    The multiplier 1 that an autonomous system always has is left out, and so are virtual branches. Infinite ones lie on
+    the upper edge.
 
     **Arguments:**
 
@@ -126,7 +129,7 @@ def multiplier_diagram(
     shown, default = PARTS[part]
     special = [found for found, _, _ in _special_points(branch)]
     autonomous = branch.system.period is None
-    lines = [line for one in branch.branches for line in _lines(one, autonomous, which)]
+    lines = [line for one in branch.branches if one.admissible.any() for line in _lines(one, autonomous, which)]
     jumps = [(found.value, path) for found in special for path in _jumps(found, autonomous, which)]
     finite = [shown(values[np.isfinite(values)]) for values in (*(line[1] for line in lines), *(j[1] for j in jumps))]
     low, high = (pick(np.concatenate([*finite, [0.0, 1.0]])) for pick in (np.min, np.max))
@@ -188,9 +191,10 @@ def multiplier_circle(bifurcation: OrbitBifurcation, *, ax: "Axes | None" = None
 
 
 def _measured(measure: Measure, branch: OrbitBranch) -> np.ndarray:
-    if not callable(measure):
+    recorded = branch.records.get(measure) if isinstance(measure, str) else None
+    if recorded is None and not callable(measure):
         return amplitude(branch, measure)
-    heights = np.asarray(measure(branch), float)
+    heights = np.asarray(measure(branch) if callable(measure) else recorded, float)
     if heights.shape != branch.values.shape:
         raise ValueError(
             "Argument `measure` must give a number for each point of a branch, an array of shape "
@@ -202,6 +206,8 @@ def _measured(measure: Measure, branch: OrbitBranch) -> np.ndarray:
 def _measure_label(measure: Measure, branch: OrbitBranch, labels: Labels) -> str:
     if callable(measure):
         return axis_label(labels, "measure")
+    if measure in branch.records:
+        return axis_label(labels, measure)
     (name,) = chosen(components(jax.tree.map(lambda x: x[0], branch.ys)), [measure])
     symbol, bracket, unit = axis_label(labels, name).partition(" [")
     return f"max |{symbol}|{bracket}{unit}"
@@ -210,7 +216,7 @@ def _measure_label(measure: Measure, branch: OrbitBranch, labels: Labels) -> str
 def _kinds(branch: OrbitBranch) -> np.ndarray:
     """Of each point, its key in `STYLES`."""
     infinite = np.isinf(branch.multipliers).any(axis=1)
-    return np.where(branch.stable, 0, np.where(infinite, 2, 1))
+    return np.where(~branch.admissible, 3, np.where(branch.stable, 0, np.where(infinite, 2, 1)))
 
 
 def _special_points(branch: OrbitBranch) -> Iterator[tuple[OrbitBifurcation, int, int]]:

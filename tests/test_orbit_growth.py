@@ -1,19 +1,22 @@
-"""Branches in files: interrupted, saved, loaded, gone on with."""
+"""Continuations while they grow: interrupted, saved, loaded, gone on with; measured and watched."""
 
 import dataclasses
 import json
+from functools import partial
 from typing import NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from models import Motion, pid
 
 import nsjax
 from nsjax import find_orbit, gallery, OrbitBranch, OrbitGrowth
+from nsjax._progress import ProgressLine
 
 
 METHOD = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-12), max_steps=8192)
@@ -40,6 +43,26 @@ class Plane(NamedTuple):
     q: jax.Array
 
 
+def mean(ts, values):
+    return np.trapezoid(values, ts) / (ts[-1] - ts[0])
+
+
+def sticking(ts, ys):
+    """For how long the velocity stays what it is."""
+    return np.sum(np.diff(ts)[np.abs(np.diff(ys.v)) < 1e-13])
+
+
+def ends(ts, ys):
+    return np.array([[ts[0], ys.x[0]], [ts[-1], ys.x[-1]]])
+
+
+MEASURES = {
+    "mean": lambda ts, ys: mean(ts, ys["x"]),
+    "loss": lambda ts, ys: mean(ts, 0.2 * ys["v"] ** 2),
+    "input": lambda ts, ys: mean(ts, 5.0 * np.cos(2 * np.pi * ts / (ts[-1] - ts[0])) * ys["v"]),
+}
+
+
 def grown(system, orbit, parameter, interval, **options):
     """A continuation that is done, and how many points it gave."""
     growth = OrbitGrowth(system, orbit, parameter, interval, **options)
@@ -51,8 +74,8 @@ def belt():
     """Section 6.7, through the fold beyond which orbits are infinitely unstable."""
     system = gallery.StickSlip(c=0.1, v_dr=0.5)
     orbit = find_orbit(system, Motion(2.0, 0.0), period=8.0, **METHOD, max_events=16)
-    what = (system, orbit, "v_dr", (0.45, 1.3))
-    return what, *grown(*what)
+    what, options = (system, orbit, "v_dr", (0.45, 1.3)), dict(record={"stick": sticking, "ends": ends})
+    return what, options, *grown(*what, **options)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +83,7 @@ def duffing():
     """Orbits that are not symmetric, up to where they meet the symmetric ones."""
     system = Duffing()
     orbit = find_orbit(system, {"x": jnp.asarray(1.5), "v": jnp.asarray(0.0)}, **METHOD)
-    what, options = (system, orbit, "omega", (0.91, 1.02)), dict(max_step=0.1, max_laps=1)
+    what, options = (system, orbit, "omega", (0.91, 1.02)), dict(max_step=0.1, max_laps=1, record=MEASURES)
     return what, options, *grown(*what, **options)
 
 
@@ -83,13 +106,13 @@ def same(found, want):
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.55, 0.8, 1.0])
 def test_gone_on_with(belt, tmp_path, share):
-    what, whole, count = belt
-    growth = OrbitGrowth(*what)
+    what, options, whole, count = belt
+    growth = OrbitGrowth(*what, **options)
     for _ in range(int(share * count)):
         next(growth)
     growth.save(tmp_path / "growth")
     part = growth.branch
-    loaded = OrbitGrowth.load(tmp_path / "growth", gallery.StickSlip())
+    loaded = OrbitGrowth.load(tmp_path / "growth", gallery.StickSlip(), **options)
     same(loaded.branch, part)
     assert sum(1 for _ in loaded) == count - int(share * count)
     same(loaded.branch, whole.branch)
@@ -105,7 +128,7 @@ def test_several_branches(duffing, tmp_path):
         next(growth)
         if i % 7 == 0:
             growth.save(tmp_path / "growth")
-            growth = OrbitGrowth.load(tmp_path / "growth", Duffing(omega=3.0))
+            growth = OrbitGrowth.load(tmp_path / "growth", Duffing(omega=3.0), record=options["record"])
     with pytest.raises(StopIteration):
         next(growth)
     same(growth.branch, whole.branch)
@@ -114,8 +137,8 @@ def test_several_branches(duffing, tmp_path):
 
 def test_interrupted(belt, tmp_path, monkeypatch):
     """By the user: between two points, or in the middle of the work on one."""
-    what, whole, count = belt
-    growth = OrbitGrowth(*what)
+    what, options, whole, count = belt
+    growth = OrbitGrowth(*what, **options)
     with pytest.raises(KeyboardInterrupt):
         for i, _ in enumerate(growth):
             if i == 5:
@@ -136,14 +159,14 @@ def test_interrupted(belt, tmp_path, monkeypatch):
             for _ in growth:
                 pass
         growth.save(tmp_path / "growth")
-        growth = OrbitGrowth.load(tmp_path / "growth", what[0])
+        growth = OrbitGrowth.load(tmp_path / "growth", what[0], **options)
     monkeypatch.undo()
     assert sum(1 for _ in growth) > 0
     same(growth.branch, whole.branch)
 
 
 def test_branches(belt, duffing, tmp_path):
-    for whole, system in ((belt[1].branch, gallery.StickSlip()), (duffing[2].branch, Duffing())):
+    for whole, system in ((belt[2].branch, gallery.StickSlip()), (duffing[2].branch, Duffing())):
         whole.save(tmp_path / "branch.npz")
         same(OrbitBranch.load(tmp_path / "branch.npz", system), whole)
     assert [path.name for path in tmp_path.iterdir()] == ["branch.npz"]
@@ -175,7 +198,7 @@ def test_mistakes(belt, duffing, tmp_path):
     path = tmp_path / "growth"
     duffing[2].save(path)
     whole = path.read_bytes()
-    load, model = OrbitGrowth.load, Duffing()
+    load, model = partial(OrbitGrowth.load, record=MEASURES), Duffing()
     for size in (0, 10, len(whole) // 2, len(whole) - 30):
         path.write_bytes(whole[:size])
         with pytest.raises(ValueError, match="damaged, or nsjax did not write it"):
@@ -217,3 +240,103 @@ def test_mistakes(belt, duffing, tmp_path):
         load(path, model, solver=dfx.Tsit5())
     with pytest.raises(ValueError, match="must be those with which the branch was begun"):
         load(path, model, stepsize_controller=pid(1e-11))
+    with pytest.raises(ValueError, match="must hold functions of the names"):
+        load(path, model, record={"mean": MEASURES["mean"]})
+
+
+def test_records(belt, duffing):
+    """Against what else is known of the orbits, and a balance of power."""
+    for part in duffing[2].branch.branches:
+        np.testing.assert_allclose(part.records["mean"], part.mean["x"], atol=2e-3)
+        np.testing.assert_allclose(part.records["input"], part.records["loss"], rtol=1e-2)
+        np.testing.assert_array_less(0.1, part.records["loss"])
+    part = belt[2].branch
+    bounds, stick = part.records["ends"], part.records["stick"]
+    assert bounds.shape == (len(part), 2, 2)
+    np.testing.assert_allclose(bounds[:, 1, 0] - bounds[:, 0, 0], part.periods, rtol=1e-12)
+    np.testing.assert_allclose(bounds[:, 0, 1], bounds[:, 1, 1], atol=1e-9)
+    np.testing.assert_array_less(0.5, stick[part.values < 0.6])
+    np.testing.assert_array_less(stick, part.periods)
+
+
+def test_records_are_drawn(duffing):
+    branch = duffing[2].branch
+    ax = nsjax.plot.orbit_diagram(branch, "loss", labels={"loss": "P [W]"}, names=False)
+    assert ax.get_ylabel() == "P [W]"
+    drawn = np.concatenate([line.get_ydata() for line in ax.lines])
+    assert np.isin(branch.records["loss"], drawn).all()
+    with pytest.raises(ValueError, match="one number for each|a number for each"):
+        nsjax.plot.orbit_diagram(eqx.tree_at(lambda b: b.records["loss"], branch, np.zeros((len(branch), 2))), "loss")
+    plt.close("all")
+
+
+@pytest.mark.parametrize(
+    "record, message",
+    [
+        ({"speed": lambda ts, ys: ys["u"]}, "`record\\['speed'\\]` failed .* KeyError"),
+        ({"ys": lambda ts, ys: ys}, "`record\\['ys'\\]` must return a number or an array"),
+        ({"sum": 3.0}, "must map names to functions, but maps 'sum' to 3.0"),
+        ({3: np.mean}, "must map names to functions"),
+    ],
+)
+def test_mistaken_records(duffing, record, message):
+    with pytest.raises(ValueError, match=message):
+        OrbitGrowth(*duffing[0], record=record)
+
+
+def test_records_of_changing_shape(duffing):
+    counter = iter(range(1, 100))
+    growth = OrbitGrowth(*duffing[0], record={"more": lambda ts, ys: np.zeros(next(counter))})
+    with pytest.raises(ValueError, match="`record\\['more'\\]` must return arrays of one shape, but gave \\(2,\\)"):
+        next(growth)
+
+
+def test_progress(duffing, capsys):
+    what, options, whole, count = duffing
+    branch = nsjax.continue_orbit(*what, **options, progress=True)
+    same(branch, whole.branch)
+    written = capsys.readouterr().err
+    assert written.endswith("\n") and written.count("\n") == 1
+    lines = written.strip("\n").split("\r")
+    assert lines[0] == "" and 2 <= len(lines) < count
+    assert lines[1].startswith("branch 1, 2 points, omega = ") and lines[1].endswith(", 0 special points")
+    assert lines[-1].startswith("branch 2, ") and lines[-1].rstrip() == str(whole)
+    assert sum(len(part) for part in branch.branches) == pytest.approx(int(lines[-1].split()[2]), abs=1)
+
+
+def test_progress_line(capsys, monkeypatch):
+    """At most ten times a second; what is longer is covered; and an error ends the line."""
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    with pytest.raises(KeyboardInterrupt), ProgressLine() as line:
+        for text in ("first", "second", "third", "4", "fifth"):
+            line.show(text)
+            now[0] += 0.06
+        raise KeyboardInterrupt
+    assert capsys.readouterr().err == "\rfirst\rthird\rfifth\rfifth\n"
+
+
+def is_point(orbit, branch, index):
+    """Whether it is the orbit at a point of a branch."""
+    np.testing.assert_allclose(orbit.period, branch.periods[index], rtol=1e-9)
+    np.testing.assert_allclose(getattr(orbit.system, branch.parameter), branch.values[index], rtol=1e-14)
+    for leaf, leaves in zip(jax.tree.leaves(orbit.y0), jax.tree.leaves(branch.ys)):
+        np.testing.assert_allclose(leaf, leaves[index], atol=1e-8)
+    assert orbit.admissible and bool(orbit.stable) == branch.stable[index]
+    want = branch.multipliers[index]
+    known = np.isfinite(want)
+    order = np.argsort(-np.abs(np.asarray(orbit.multipliers)), kind="stable")
+    np.testing.assert_allclose(np.abs(orbit.multipliers)[order][known], np.abs(want)[known], atol=1e-6)
+    assert np.isinf(orbit.multipliers).sum() == np.isinf(want).sum()
+
+
+def test_orbit_at_a_point(belt, duffing):
+    """Stable, unstable, and infinitely unstable orbits."""
+    part = belt[2].branch
+    for index in (3, len(part) - 2):
+        is_point(part.orbit(index), part, index)
+    assert part.stable[3] and np.isinf(part.multipliers[-2, 0])
+    first, other = duffing[2].branch.branches
+    stable, unstable = np.flatnonzero(first.stable)[0], np.flatnonzero(~other.stable)[3]
+    is_point(first.orbit(stable), first, stable)
+    is_point(other.orbit(unstable, method="shooting"), other, unstable)
