@@ -106,6 +106,9 @@ class _Cycle(eqx.Module):
         one = jnp.ones_like(begin)
         moves = (one, one, field(begin, first, cuts.within), field(end, xs[:, -1], cuts.ending))
         _, rates = jax.jvp(lambda *a: self.conditions(system, *a), now, moves)
+        # What comes onto a surface tangentially, to be left freely, has none there: the better the guess, the less.
+        tangential = jnp.asarray(cuts.free[1:] + cuts.free[:1])
+        rates = (jnp.where(tangential, 1, rates[0]), rates[1])
         rates = jax.tree.map(lambda r: jnp.where((r == 0) | ~jnp.isfinite(r), 1, r), rates)
         normal = moves[2][0]
         return (begin, end, x), rates, normal / jnp.where(normal @ normal == 0, 1, normal @ normal)
