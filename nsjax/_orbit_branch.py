@@ -108,8 +108,14 @@ class OrbitBranch(eqx.Module):
         - `options`: for `find_orbit`. The orbit is found in segments, however unstable it is, which is a program for
             each number of them; with `method="shooting"`, for orbits that are not very unstable, it is one for all.
 
-        **Returns:** the `Orbit`, of `system_at(index)`. On a virtual branch it is not admissible.
+        **Returns:** the `Orbit`, of `system_at(index)`.
+
+        **Raises:** `ValueError` for a point of a virtual branch.
         """
+        if not self.admissible[index]:
+            raise ValueError(
+                f"Argument `index` must be that of an orbit of the system, but point {index} of this branch is virtual."
+            )
         system, t0 = self.system_at(index), self.ts[index]
         guess: dict[str, Any] = dict(segments=self.segments[index])
         if options.get("method") == "shooting":

@@ -12,7 +12,7 @@ from ._cycles import Cycle
 from ._orbit_curve import OrbitCurve, with_parameter
 from ._orbit_grazing import grazing_at
 from ._orbit_node import admissible, Half, together, tracer_for, with_order
-from ._orbit_trace import Arc, OrbitTracer, Spot, turned
+from ._orbit_trace import Arc, OrbitTracer, PASSED, Spot, turned
 from ._return_map import Base, follow, frame
 
 
@@ -53,18 +53,20 @@ def _beside(tracer: OrbitTracer, at: Spot, found: Spot) -> Spot | None:
     away from the corner; None if the way does not come there."""
     short = dataclasses.replace(tracer, max_points=BACK)
     for back in (turned(found), found):
-        arc = Arc([back])
-        for _ in short.arc(arc):
-            pass
+        arc, passed = Arc((back,)), []  # at which points something else is
+        while not arc.over:
+            arc = short.further(arc)
+            if arc.at is not None and arc.at.test.kind in PASSED:
+                passed.append(len(arc.spots) - 1)
         end = arc.end
         if end is not None and end.test.kind == "guard":
             end = grazing_at(tracer, end)
         if end is None or not together(end.spot, at, tracer.curve, NEIGHBOUR):
             continue
-        if not arc.passed:
+        if not passed:
             return turned(back)
         last, final = arc.spots[-2:]
-        if arc.passed[-1][0] < len(arc.spots) - 2:
+        if passed[-1] < len(arc.spots) - 2:
             return turned(last)
         way = final.look.u - last.look.u
         between = tracer.corrected(found.course, last.look.u + way / 2, way / np.linalg.norm(way))
