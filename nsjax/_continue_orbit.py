@@ -4,30 +4,26 @@ import contextlib
 import dataclasses
 import os
 import warnings
-from typing import Any
 
 import diffrax as dfx
-import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 
 from ._archive import Archive, plain, save, table
 from ._arcs import model_of
-from ._course import Course, start_of
+from ._course import Course
 from ._cycles import Cycle
 from ._orbit import Orbit
 from ._orbit_branch import orbit_branch, OrbitBranch, OrbitStrand, Point, TYPES as OF_BRANCHES
-from ._orbit_curve import guard_sizes, Look, OrbitCurve
+from ._orbit_curve import Look, OrbitCurve
 from ._orbit_node import Half, itinerary, Node
 from ._orbit_record import Measures, Recorder
+from ._orbit_start import curve_and_start, options
 from ._orbit_trace import Arc, OrbitTracer, Spot, Test, Zero
 from ._orbit_tree import Exit, OrbitExplorer, OrbitTree, Walk
 from ._parameter import get_parameter, parameter_path
 from ._progress import ProgressLine
-from ._segment_flow import exactness
-from ._solution import is_okay
-from ._system import arrays_of, System
+from ._system import System
 from ._types import Y
 
 
@@ -159,63 +155,15 @@ class OrbitGrowth:
         stepsize_controller: dfx.AbstractStepSizeController | None = None,
         max_steps: int = 4096,
     ):
-        path = parameter_path(system, parameter)
-        low, high = (float(x) for x in interval)
-        dtype = jnp.result_type(orbit.t0)
-        if dtype != jnp.float64:
-            raise ValueError(
-                f"Continuation locates special points to more digits than {dtype} has: call "
-                '`jax.config.update("jax_enable_x64", True)` first, and find `orbit` in double precision.'
-            )
-        if not bool(is_okay(orbit.result)) or not bool(orbit.admissible):
-            raise ValueError("Argument `orbit` must be an orbit that was found, and is admissible, but is not.")
-        system = arrays_of(system, dtype)
-        value = float(get_parameter(system, path))
-        if not low < high or not low <= value <= high:
-            raise ValueError(
-                f"Argument `interval` must be (low, high) and hold {value:.6g}, the value of `{parameter}` in "
-                f"`system`, but is ({low:.6g}, {high:.6g})."
-            )
-        order = 1
-        if system.period is not None:
-            order = int(round(float(orbit.period) / float(system.period)))
-        start = start_of(system, orbit)
-        rows = np.concatenate([np.asarray(jfu.ravel_pytree(y)[0])[None] for y in _points(orbit)])
-        sizes = np.ptp(rows, axis=0) / 2
-        sizes = np.where(sizes > 1e-12 * max(1e-300, sizes.max()), sizes, max(sizes.max(), 1e-300))
-        if scale is not None:
-            sizes = np.abs(np.asarray(jfu.ravel_pytree(scale)[0], np.float64))
-            if sizes.shape != rows.shape[1:] or not np.all(sizes > 0):
-                raise ValueError("Argument `scale` must hold a positive number for each component of the state.")
-        model = model_of(system, orbit.t0, orbit.y0)
-        flat = jfu.ravel_pytree(orbit.y0)[0]
-        curve = OrbitCurve(
-            model=model,
-            path=path,
-            like=orbit.y0,
-            low=np.asarray(low),
-            width=np.asarray(high - low),
-            sizes=sizes,
-            time=np.asarray(float(orbit.period)),
-            guard_sizes=np.ones(len(model.slots)),
-            order=np.asarray(order, np.int32),
-            normal=np.zeros_like(sizes),
-            reference=np.asarray(flat),
-            how=_how(solver, stepsize_controller, max_steps),
-            exact=exactness(model, jnp.asarray(orbit.t0), orbit.y0),
-        )
-        if system.period is None:
-            state = curve.state(jnp.asarray(start.course.mode[0]), jnp.asarray(start.course.part[0]))
-            f = np.asarray(jfu.ravel_pytree(model.flow(jnp.asarray(start.begin[0]), orbit.y0, state))[0])
-            curve = dataclasses.replace(curve, normal=f / np.maximum(f @ f, 1e-300))
-        curve = dataclasses.replace(curve, guard_sizes=guard_sizes(curve, start))
+        how = options(solver, stepsize_controller, max_steps)
+        curve, start = curve_and_start(system, orbit, parameter, interval, scale, how)
+        start, value = start.filled(), get_parameter(curve.model.system, curve.path)
         tracer = OrbitTracer(curve, max_step, max_points)
-        start = start.filled()
         spot = tracer.corrected(start.course, np.asarray(curve.pack(start, value)))
         if spot is None:
             raise ValueError("Argument `orbit` must be an orbit of `system`, but none was found next to it.")
         self._explorer = OrbitExplorer(
-            tracer, parameter, max_branches, max_laps * order, Recorder(record or {}), virtual
+            tracer, parameter, max_branches, max_laps * int(curve.order), Recorder(record or {}), virtual
         )
         self._tree = self._explorer.planted(spot)
 
@@ -290,7 +238,7 @@ class OrbitGrowth:
         or has other records.
         """
         archive = Archive(path, "OrbitGrowth", TYPES, system, y)
-        how = _how(solver, stepsize_controller, max_steps)
+        how = options(solver, stepsize_controller, max_steps)
         if plain(repr(how)) != archive.part("how"):
             raise ValueError(
                 "Arguments `solver`, `stepsize_controller` and `max_steps` must be those with which the branch was "
@@ -316,15 +264,3 @@ class OrbitGrowth:
         for name, value in growth._tree.branches[0][1].points[0].record.items():
             recorder.shapes[name] = value.shape
         return growth
-
-
-def _how(solver: Any, stepsize_controller: Any, max_steps: int) -> tuple[tuple[str, Any], ...]:
-    controller = dfx.PIDController(rtol=1e-12, atol=1e-12) if stepsize_controller is None else stepsize_controller
-    return (("solver", solver), ("stepsize_controller", controller), ("max_steps", max_steps))
-
-
-def _points(orbit: Orbit) -> list[Any]:
-    path = orbit.path(33)
-    rows = jax.vmap(jax.vmap(lambda y: jfu.ravel_pytree(y)[0]))(path.y)
-    rows = np.asarray(rows).reshape(-1, rows.shape[-1])
-    return list(rows[np.isfinite(rows).all(axis=1)])
