@@ -295,9 +295,11 @@ class OrbitTracer:
         found.sort(key=lambda zero: zero.s)
         final = next((z for z in found if z.test.kind not in PASSED), None)
         if final is not None:
-            # What lies before the end of the course may have changed back beyond it.
+            # What lies before the end of the course may have changed back beyond it. (At a branch point it may turn.)
             there = tests(self.curve, final.spot, scale)
             for test in (t for t in before if t.kind in PASSED and before[t] * there[t] < 0):
+                if test.kind == "fold" and final.test == BRANCH:
+                    continue
                 if any(z.test == test and z.s <= final.s for z in found):
                     continue
                 zero = self.located(spot, final.spot, final.s, test, scale)
