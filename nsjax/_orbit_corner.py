@@ -66,7 +66,9 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
     mapped, points = found_map
     arrived = tuple(int(kinds[t.row] == "duration" or bounces) for t in touches)
     cycles = cycles_of(mapped, most) if mapped.corner.e.any() else _through(mapped.corner, zero.side, arrived)
-    halves = [half for cycle in cycles.cycles if (half := half_of(tracer, spot, points, cycle)) is not None]
+    halves = [
+        half for cycle in cycles.cycles if (half := half_of(tracer, spot, mapped.corner, points, cycle)) is not None
+    ]
     _pair(halves)
     made = described(name, curve, spot, mapped, cycles, halves, touches, arrived)
     return Node(spot, int(curve.order), halves, made)

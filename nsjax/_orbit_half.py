@@ -1,6 +1,7 @@
 """The half-branches that the normal form of a corner foretells, entered next to it."""
 
 import dataclasses
+import itertools
 from typing import Any
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._course import same_course, Start, start_from
-from ._cycles import Cycle
+from ._cycles import CornerMap, Cycle
 from ._orbit_curve import OrbitCurve, with_parameter
 from ._orbit_grazing import grazing_at
 from ._orbit_node import admissible, Half, together, tracer_for, with_order
@@ -17,23 +18,33 @@ from ._return_map import Base, follow, frame
 
 
 DEPARTURES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-7)  # at which a half-branch is entered: of the parameter, in its interval
+PUSHES = (0.0, 1.0, 10.0)  # towards the side of the border where a cycle is, over the square of the distance
 BACK = 40  # points from there to the corner
 NEIGHBOUR = 1e-5  # at which the corner is known again
 
 
-def half_of(tracer: OrbitTracer, spot: Spot, points: list[Base], cycle: Cycle) -> Half | None:
+def half_of(tracer: OrbitTracer, spot: Spot, corner: CornerMap, points: list[Base], cycle: Cycle) -> Half | None:
     """The orbit that a cycle of the normal form foretells, a little way off: piece by piece by the flow, which finds
     its itinerary, and then corrected."""
     own = tracer_for(tracer, with_order(tracer.curve, int(tracer.curve.order) * cycle.laps))
-    for departure in DEPARTURES:
+    for departure, push in itertools.product(DEPARTURES, PUSHES if corner.square.any() else PUSHES[:1]):
         distance = min(departure, 10 * departure / max(1e-12, float(np.abs(cycle.points).max())))
-        found = _entered(own, spot, points, cycle, distance)
+        away = _pushed(corner, cycle, push * distance)
+        found = _entered(own, spot, points, cycle._replace(points=cycle.points + away), distance)
         if found is None or not admissible(own.curve, found):
             continue
         found = _beside(own, spot, found if float(found.look.tangent[-1]) * cycle.side >= 0 else turned(found))
         if found is not None:
             return Half(found, own.curve, cycle.laps, cycle.side, cycle)
     return None
+
+
+def _pushed(corner: CornerMap, cycle: Cycle, size: float) -> np.ndarray:
+    """A shift of the points by which an event with a square root happens, or does not: where it is taken the distance
+    from the border is of second order, and so is what the normal form leaves out."""
+    places = np.arange(len(cycle.word)) % len(corner.c)
+    toward = np.where(np.array(cycle.word) == 1, -1.0, 1.0) * corner.square[places]
+    return size * toward[:, None] * corner.n[places] * np.max(np.abs(cycle.points)) ** 2
 
 
 def _entered(tracer: OrbitTracer, spot: Spot, points: list[Base], cycle: Cycle, distance: float) -> Spot | None:
