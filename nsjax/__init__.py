@@ -4,6 +4,11 @@ from . import gallery as gallery, plot as plot
 from ._bifurcation import Bifurcation as Bifurcation, HalfBranch as HalfBranch
 from ._branch import Branch as Branch
 from ._brute_force import brute_force as brute_force, BruteForce as BruteForce
+from ._continue_bifurcation import (
+    BifurcationCurve as BifurcationCurve,
+    CodimensionTwo as CodimensionTwo,
+    continue_bifurcation as continue_bifurcation,
+)
 from ._continue_equilibrium import continue_equilibrium as continue_equilibrium
 from ._continue_orbit import continue_orbit as continue_orbit, OrbitGrowth as OrbitGrowth
 from ._continue_orbits import continue_orbits as continue_orbits, OrbitBranches as OrbitBranches

@@ -7,11 +7,22 @@ import jax.flatten_util as jfu
 import numpy as np
 
 from ._cycles import CornerKind
+from ._orbit_curve import OrbitCurve
+from ._orbit_trace import Spot, Test
 from ._pencil import EigenvalueCrossing
 from ._types import Y
 
 
+SMOOTH = {kind: kind for kind in ("fold", "flip", "Neimark-Sacker")}  # and the test function that tells it
 ONES = ("fold", "symmetry breaking", "transcritical", "branch point", "3 to 1", "1 to 3")
+
+
+class Origin(NamedTuple):
+    """A special point as the continuation saw it: what vanishes there, where, and on which curve."""
+
+    test: Test
+    spot: Spot
+    curve: OrbitCurve
 
 
 class OrbitHalf(NamedTuple):
@@ -58,6 +69,7 @@ class OrbitBifurcation(NamedTuple):
     - `monodromies`: the matrices that belong to them: the ends of the set-valued one (6.13).
     - `crossings`: of the unit circle on the way from one to the other.
     - `halves`: the half-branches that meet there.
+    - `origin`: what `continue_bifurcation` sets out from; None if the point was loaded.
     """
 
     kind: str
@@ -78,6 +90,7 @@ class OrbitBifurcation(NamedTuple):
     monodromies: tuple[np.ndarray, np.ndarray]
     crossings: Sequence[EigenvalueCrossing]
     halves: Sequence[OrbitHalf]
+    origin: "Origin | None" = None
 
     @property
     def name(self) -> str:
@@ -118,7 +131,7 @@ class OrbitBifurcation(NamedTuple):
             kind=kind, discontinuous=False, criticality=criticality, evidence="both" if halves else "crossing",
             by_count=kind, by_crossing=(kind,), transition=None, count=(below, above), surfaces=(), crossings=[],
             multipliers=(spot.multipliers, spot.multipliers), monodromies=(spot.monodromy, spot.monodromy),
-            halves=halves, **_common(name, spot, curve),
+            halves=halves, origin=Origin(Test(SMOOTH.get(kind, "branch")), spot, curve), **_common(name, spot, curve),
         )  # fmt: skip
 
     @classmethod

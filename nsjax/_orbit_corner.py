@@ -5,7 +5,7 @@ import numpy as np
 from ._course import capacity_for, EVENT, FREE, Start
 from ._crossings import eigenvalue_crossings
 from ._cycles import corner_kind, CornerMap, Cycle, Cycles, find_cycles
-from ._orbit_bifurcation import named, OrbitBifurcation
+from ._orbit_bifurcation import named, OrbitBifurcation, Origin
 from ._orbit_curve import linearised, OrbitCurve
 from ._orbit_half import half_of, NEIGHBOUR
 from ._orbit_node import (
@@ -36,7 +36,10 @@ def node_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | Non
     if zero.test.kind == "branch":
         return branch_point_at(tracer, name, zero.spot)
     if zero.test.kind in (*CORNERS, "grazing"):
-        return corner_at(tracer, name, zero, most)
+        node = corner_at(tracer, name, zero, most)
+        if node is not None:
+            node.bifurcation = node.bifurcation._replace(origin=Origin(zero.test, zero.spot, tracer.curve))
+        return node
     return None
 
 

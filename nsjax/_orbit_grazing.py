@@ -42,11 +42,21 @@ def grazing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
 def _cut(tracer: OrbitTracer, spot: Spot, cuts: list[tuple[int, int]]) -> tuple[Spot, list[int]] | None:
     """The orbit with cuts where these guards are least along these segments, at the parameter at which the first of
     them vanishes; and the segments that end with the cuts."""
-    curve, look, n = tracer.curve, spot.look, int(spot.course.num)
+    start, by_cut = cut_course(tracer.curve, spot, cuts)
+    at = tracer.corrected(start.course, np.asarray(tracer.curve.pack(start, spot.parameter)))
+    if at is None:
+        return None
+    found = _zero_along(tracer, at, by_cut[cuts[0]])
+    return None if found is None else (found, [by_cut[pair] for pair in cuts])
+
+
+def cut_course(curve: OrbitCurve, spot: Spot, cuts: list[tuple[int, int]]) -> tuple[Start, dict[tuple[int, int], int]]:
+    """An orbit cut where these guards are least along these segments; and which segment ends with which cut."""
+    look, n = spot.look, int(spot.course.num)
     c = spot.course
     whole = c.ends[0] == TIME
     rows: list[Any] = []
-    order: list[tuple[int, int]] = []
+    order: dict[tuple[int, int], int] = {}
     for i in range(n):
         inside = sorted((float(look.where[i, j]), j) for r, j in cuts if r == i)
         begin, x = look.begin[i], look.x[i]
@@ -55,7 +65,7 @@ def _cut(tracer: OrbitTracer, spot: Spot, cuts: list[tuple[int, int]]) -> tuple[
             t = look.begin[i] + share * span
             entry = _component(curve, look, c, i, j, t)
             rows.append((c.mode[i], c.part[i], LEAST, j, entry, begin, t, x))
-            order.append((i, j))
+            order[i, j] = len(rows) - 1
             begin, x = t, look.spots[i, j]
         rows.append((c.mode[i], c.part[i], c.ends[i], c.slot[i], c.entry[i], begin, look.end[i], x))
     if whole:  # its beginning is none of its events
@@ -67,13 +77,7 @@ def _cut(tracer: OrbitTracer, spot: Spot, cuts: list[tuple[int, int]]) -> tuple[
     ends, slot, entry = (column.astype(np.int32) for column in (ends, slot, entry))
     course = Course(mode, part, ends, slot, entry, np.asarray(len(rows), np.int32))
     start = Start(course, begins, stops, xs).filled()
-    at = tracer.corrected(start.course, np.asarray(curve.pack(start, spot.parameter)))
-    if at is None:
-        return None
-    targets = [i for i, row in enumerate(rows) if row[2] == LEAST]
-    by_cut = dict(zip(order, targets))
-    found = _zero_along(tracer, at, by_cut[cuts[0]])
-    return None if found is None else (found, [by_cut[pair] for pair in cuts])
+    return start, order
 
 
 def _component(curve: OrbitCurve, look: Any, course: Course, i: int, j: int, t: float) -> int:

@@ -102,8 +102,17 @@ def midpoint(curve: OrbitCurve, spot: Spot, rows: Iterable[int]) -> tuple[float,
 
 def tests(curve: OrbitCurve, spot: Spot, scale: float) -> dict[Test, float]:
     """Functions of the points of a branch; those of `CORNERS` are positive as long as the orbit is one."""
-    look, course = spot.look, spot.course
+    look = spot.look
     out = {Test("low"): float(look.u[-1]), Test("high"): 1 - float(look.u[-1])}
+    out |= corner_tests(curve, spot)
+    out[Test("fold")] = float(look.tangent[-1])
+    out[BRANCH] = branch_test(spot, scale)
+    return out | circle_tests(curve, spot)
+
+
+def corner_tests(curve: OrbitCurve, spot: Spot) -> dict[Test, float]:
+    look, course = spot.look, spot.course
+    out = {}
     ends, slots = np.asarray(course.ends), np.asarray(look.least)
     length = (np.asarray(look.end) - np.asarray(look.begin)) / float(curve.time)
     rates, margins, n = np.asarray(look.rates), np.asarray(look.margins), int(course.num)
@@ -118,15 +127,24 @@ def tests(curve: OrbitCurve, spot: Spot, scale: float) -> dict[Test, float]:
         for j, value in enumerate(slots[i]):
             if np.isfinite(value):
                 out[Test("guard", i, j)] = float(value)
-    out[Test("fold")] = float(look.tangent[-1])
-    sign, log = np.asarray(look.branch)
-    out[Test("branch")] = float(sign * np.exp(np.clip(log - scale, -300, 300)))
+    return out
+
+
+def branch_test(spot: Spot, scale: float) -> float:
+    """The determinant of the equations bordered by the tangent, over exp(scale)."""
+    sign, log = np.asarray(spot.look.branch)
+    return float(sign * np.exp(np.clip(log - scale, -300, 300)))
+
+
+def circle_tests(curve: OrbitCurve, spot: Spot) -> dict[Test, float]:
+    """Of the multipliers: where one is -1, and where two have the product 1."""
     rho = spot.trivial(curve.autonomous)
     finite = rho[np.isfinite(rho)]
-    out[Test("flip")] = float(np.prod((1 + finite) / (1 + np.abs(finite))).real)
     pairs = [finite[i] * finite[j] - 1 for i in range(len(finite)) for j in range(i)]
-    out[Test("Neimark-Sacker")] = float(np.prod([p / (1 + abs(p)) for p in pairs]).real) if pairs else 1.0
-    return out
+    return {
+        Test("flip"): float(np.prod((1 + finite) / (1 + np.abs(finite))).real),
+        Test("Neimark-Sacker"): float(np.prod([p / (1 + abs(p)) for p in pairs]).real) if pairs else 1.0,
+    }
 
 
 class Zero(NamedTuple):

@@ -9,6 +9,7 @@ from ._orbit_branch import (
     multiplier_diagram as multiplier_diagram,
     orbit_diagram as orbit_diagram,
 )
+from ._parameter_plane import parameter_plane as parameter_plane
 from ._path import components as components
 from ._phase import phase_portrait as phase_portrait, poincare_section as poincare_section
 from ._poincare import brute_force as brute_force, poincare_map as poincare_map

@@ -1,0 +1,207 @@
+"""Along a curve of special points of periodic orbits in two parameters, to where the orbits are none any more."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import toms748
+
+from ._orbit_curve import linearised
+from ._orbit_grazing import cut_course
+from ._orbit_surface import AbstractLocus, CUSP, DELTA, Locus, Place, RESONANCES, seen_at
+from ._orbit_trace import CORNERS, FIRST, SHORTEST, Spot, Test, TURN
+
+
+TOGETHER = 1e-3  # zeros that are nearer to each other, in steps, are one
+DEGENERATE = 1e-2  # of the slope of the test function: where it is less, two branches of its zeros cross
+# What vanishes together is told by the first. (At a resonance multipliers also pass 1 or -1.)
+RANK = (*CORNERS, *(test.kind for test in RESONANCES), "cusp", "branch", "fold", "flip", "Neimark-Sacker")
+LAST = (*CORNERS, "grazing", "low", "high", "1:1 resonance", "1:2 resonance")  # where the curve ends
+
+
+class Met(NamedTuple):
+    """What else vanishes at a point of the curve: of codimension two."""
+
+    test: Test
+    others: tuple[Test, ...]
+    spot: Spot
+    s: float = 0.0
+
+
+@dataclasses.dataclass
+class Trail:
+    """Points one after the other, and what is met at some of them; `end` is the last if it ends the curve."""
+
+    spots: list[Spot]
+    met: list[tuple[int, Met]] = dataclasses.field(default_factory=list)
+    end: Met | None = None
+    why: str = ""
+    closed: bool = False
+
+
+def trace(locus: AbstractLocus, place: Place, max_step: float, max_points: int) -> Trail:
+    """Follows the curve from a point in the direction that it has there."""
+    out, begin, length, steps = Trail([place.spot]), place, FIRST, 0
+    while len(out.spots) < max_points:
+        try:
+            after = locus.place(locus.step(place, length), place.along, place.heading)
+            turn = float(np.arccos(np.clip(place.along @ after.along, -1, 1)))
+            if turn > 0.5:
+                raise ArithmeticError("it turns too much")
+            found = _met(locus, place, after, length)
+        except ArithmeticError:
+            length /= 2
+            if length < SHORTEST:
+                out.why = "the last orbit that could be found"
+                return out
+            continue
+        for met in found:
+            out.spots.append(met.spot)
+            out.met.append((len(out.spots) - 1, met))
+            if met.test.kind in LAST:
+                out.end = met
+                return out
+        steps += 1
+        if steps > 3 and _passes(locus, place, begin, length):
+            out.spots.append(begin.spot)
+            out.closed = True
+            return out
+        out.spots.append(after.spot)
+        speed = float(np.max(np.abs(after.along) / np.maximum(1, np.abs(after.spot.look.u))))
+        length = min(max_step / speed, length * float(np.clip(TURN / max(turn, 1e-9), 0.5, 2)))
+        place = after
+    out.why = f"max_points = {max_points}"
+    return out
+
+
+def _passes(locus: AbstractLocus, place: Place, begin: Place, length: float) -> bool:
+    s = float(place.along @ (begin.spot.look.u - place.spot.look.u))
+    if not 0 < s <= length or place.along @ begin.along < 0.5:
+        return False
+    return bool(np.max(np.abs(locus.step(place, s).look.u - begin.spot.look.u)) < 1e-6)
+
+
+def _met(locus: AbstractLocus, place: Place, after: Place, length: float) -> list[Met]:
+    """What vanishes between two points, in its order, up to the end of the curve."""
+    old, new = locus.watched(place), locus.watched(after)
+    found = []
+    for test, value in old.items():
+        if test not in new or new[test] == 0 or value * new[test] > 0:
+            continue
+        if test.kind in (*CORNERS, "low", "high") and new[test] > 0:
+            continue  # it comes from where it could not be: a start on the point itself
+        found.append(_located(locus, place, length, test))
+    found = [met for met in found if _told(locus, met)]
+    rank = {kind: i for i, kind in enumerate(RANK)}
+    found.sort(key=lambda met: met.s)
+    out: list[Met] = []
+    while found:
+        near = [met for met in found if met.s - found[0].s <= TOGETHER * length]
+        found = found[len(near) :]
+        first, *others = sorted(near, key=lambda met: rank.get(met.test.kind, 99))
+        out.append(first._replace(others=tuple(met.test for met in others)))
+        if first.test.kind in LAST:
+            break
+    return out
+
+
+def _told(locus: AbstractLocus, met: Met) -> bool:
+    """Two real multipliers with the product 1 bifurcate only where both are 1, or -1."""
+    if met.test.kind != "Neimark-Sacker":
+        return True
+    rho = met.spot.multipliers
+    pair = np.any((np.abs(np.abs(rho) - 1) < 1e-5) & (np.abs(np.imag(rho)) > 1e-6))
+    at = {"fold": 1.0, "branch": 1.0, "flip": -1.0}.get(locus.test.kind)
+    double = at is not None and np.sum(np.abs(rho - at) < 1e-3) >= 2 + (locus.curve.autonomous and at == 1)
+    return bool(pair or double)
+
+
+def _located(locus: AbstractLocus, place: Place, length: float, test: Test) -> Met:
+    seen: dict[float, Spot] = {0.0: place.spot}
+
+    def value(s: float) -> float:
+        here = place
+        if s not in seen:
+            seen[s] = locus.step(place, s)
+        if test == CUSP:
+            here = locus.place(seen[s], place.along, place.heading)
+        return locus.watched(dataclasses.replace(here, spot=seen[s]))[test]
+
+    s, regular = length / 2, test.kind != "branch"
+    try:
+        if regular:
+            rough = test.kind == "guard"  # the least of samples
+            s = float(toms748(value, 0.0, length, xtol=1e-5 * length if rough else 1e-14, rtol=1e-14, maxiter=60))
+            value(s)
+            # Where the zeros of the test function cross others of its own, as at a corner at which the orbits turn
+            # round with it, points of the curve are known less and less well.
+            regular = locus.place(seen[s], place.along).slope > DEGENERATE * place.slope
+    except (ArithmeticError, KeyError):
+        regular = False
+    if not regular:
+        near = min(seen, key=lambda t: abs(t - s))
+        return _interpolated(locus, place, max(near, 0.1 * length), length, test, value)
+    spot = seen[s]
+    if test.kind == "guard" and isinstance(locus, Locus):
+        exact = _cut(locus, spot, test)
+        if exact is not None:
+            return Met(Test("grazing", test.row, test.slot), (), exact, s)
+    return Met(test, (), spot, s)
+
+
+def _interpolated(
+    locus: AbstractLocus, place: Place, s: float, length: float, test: Test, value: Callable[[float], float]
+) -> Met:
+    """A point at which the equations are singular, by polynomials through points of the curve on both sides of it."""
+    shares, values, us = [], [], []
+    for share in (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0):
+        try:
+            values.append(value(s + 0.5 * length * share))
+            us.append(locus.step(place, s + 0.5 * length * share).look.u)
+            shares.append(share)
+        except (ArithmeticError, KeyError):
+            continue
+    if len(shares) < 5 or len(values) != len(shares):
+        raise ArithmeticError("too few points beside a singular one")
+    powers = np.vander(shares, increasing=True)
+    roots = np.polynomial.Polynomial(np.linalg.solve(powers, values)).roots()
+    real = [r.real for r in roots if abs(r.imag) < 1e-6 and abs(r) < 1]
+    if not real:
+        raise ArithmeticError("nothing vanishes there")
+    root = min(real, key=abs)
+    u = np.linalg.solve(powers.T, root ** np.arange(len(shares))) @ np.stack(us)
+    spot = seen_at(locus.curve, place.spot.course, u, place.spot.look.tangent)
+    return Met(test, (), spot, s + 0.5 * length * root)
+
+
+def _cut(locus: Locus, spot: Spot, test: Test) -> Spot | None:
+    """The point of the curve at which the least value of a guard is zero exactly: the orbit cut there."""
+    start, rows = cut_course(locus.curve, spot, [(test.row, test.slot)])
+    row = rows[test.row, test.slot]
+    own = locus.test
+    if own.kind in (*CORNERS, "grazing") and row <= own.row:
+        own = own._replace(row=own.row + 1)
+    u = np.asarray(locus.curve.pack(start, spot.look.parameter))
+    border = np.linalg.svd(np.asarray(linearised(locus.curve, start.course, u)))[2][-2:]
+    try:
+        first, second = (dataclasses.replace(locus, test=t) for t in (own, Test("grazing", row)))
+        rough = seen_at(locus.curve, start.course, u, border)
+        return meet(first, second, first.at(rough, np.zeros(2)))
+    except (ArithmeticError, np.linalg.LinAlgError):
+        return None
+
+
+def meet(first: Locus, second: Locus, spot: Spot) -> Spot:
+    """Where two test functions vanish, by Newton's method on the surface."""
+    for _ in range(12):
+        here = np.array([first.value(spot), second.value(spot)])
+        sides = [[first.at(spot, sign * DELTA * e) for sign in (1, -1)] for e in np.eye(2)]
+        slopes = [[(f.value(a) - f.value(b)) / (2 * DELTA) for a, b in sides] for f in (first, second)]
+        move = np.linalg.solve(np.array(slopes), -here)
+        if not np.linalg.norm(move) < 0.3:
+            break
+        spot = first.at(spot, move)
+        if np.linalg.norm(move) < 1e-10:
+            return spot
+    raise ArithmeticError("the curves do not meet there")
