@@ -13,10 +13,10 @@ from ._orbit_bifurcation import OrbitBifurcation
 from ._orbit_curve import OrbitCurve
 from ._orbit_locus import LAST, Met, trace, Trail
 from ._orbit_singular import BranchLocus
-from ._orbit_surface import CUSP, lifted, Locus, RESONANCES, surfaces_of
+from ._orbit_surface import CUSP, impacts, lifted, Locus, RESONANCES, surfaces_of, touches
 from ._orbit_trace import CORNERS, midpoint, Spot, Test
 from ._parameter import get_parameter, parameter_path
-from ._system import impact, System
+from ._system import System
 from ._types import Y
 
 
@@ -233,8 +233,9 @@ def _kind(curve: OrbitCurve, spot: Spot, special: OrbitBifurcation, test: Test) 
 def _touching(curve: OrbitCurve, spot: Spot, test: Test) -> str:
     """How the orbit meets a surface at a corner."""
     if test.kind == "rate":
-        slot = curve.model.slots[int(spot.course.slot[test.row])]
-        return "grazing" if isinstance(curve.model.switches[slot.switch], impact) and not slot.holding else "tangency"
+        return "grazing" if impacts(curve, spot.course, test.row) else "tangency"
+    if test.kind == "duration" and touches(spot.course, test.row):
+        return "grazing"
     return "grazing" if test.kind in ("guard", "grazing") else "corner"
 
 

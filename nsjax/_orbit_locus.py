@@ -9,7 +9,7 @@ from scipy.optimize import toms748
 
 from ._orbit_curve import linearised
 from ._orbit_grazing import cut_course
-from ._orbit_surface import AbstractLocus, CUSP, DELTA, Locus, Place, RESONANCES, seen_at
+from ._orbit_surface import AbstractLocus, cleared, CUSP, DELTA, Locus, Place, RESONANCES, seen_at
 from ._orbit_trace import CORNERS, FIRST, SHORTEST, Spot, Test, TURN
 
 
@@ -154,15 +154,16 @@ def _interpolated(
     locus: AbstractLocus, place: Place, s: float, length: float, test: Test, value: Callable[[float], float]
 ) -> Met:
     """A point at which the equations are singular, by polynomials through points of the curve on both sides of it."""
-    shares, values, us = [], [], []
+    shares, values, spots = [], [], []
     for share in (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0):
         try:
+            here = locus.step(place, s + 0.5 * length * share)
             values.append(value(s + 0.5 * length * share))
-            us.append(locus.step(place, s + 0.5 * length * share).look.u)
-            shares.append(share)
         except (ArithmeticError, KeyError):
             continue
-    if len(shares) < 5 or len(values) != len(shares):
+        shares.append(share)
+        spots.append(here)
+    if len(shares) < 5:
         raise ArithmeticError("too few points beside a singular one")
     powers = np.vander(shares, increasing=True)
     roots = np.polynomial.Polynomial(np.linalg.solve(powers, values)).roots()
@@ -170,14 +171,20 @@ def _interpolated(
     if not real:
         raise ArithmeticError("nothing vanishes there")
     root = min(real, key=abs)
-    u = np.linalg.solve(powers.T, root ** np.arange(len(shares))) @ np.stack(us)
+    weights = np.linalg.solve(powers.T, root ** np.arange(len(shares)))
+    u = weights @ np.stack([here.look.u for here in spots])
     spot = seen_at(locus.curve, place.spot.course, u, place.spot.look.tangent)
+    # So are the multipliers there a limit, of saltation matrices that are none.
+    monodromy = np.tensordot(weights, np.stack([here.monodromy for here in spots]), axes=1)
+    rho = np.linalg.eigvals(monodromy)
+    rho = rho[np.argsort(-np.abs(rho))].astype(complex)
+    spot = dataclasses.replace(spot, monodromy=monodromy, multipliers=rho)
     return Met(test, (), spot, s + 0.5 * length * root)
 
 
 def _cut(locus: Locus, spot: Spot, test: Test) -> Spot | None:
     """The point of the curve at which the least value of a guard is zero exactly: the orbit cut there."""
-    start, rows = cut_course(locus.curve, spot, [(test.row, test.slot)])
+    start, rows = cut_course(locus.curve, cleared(locus.curve, spot), [(test.row, test.slot)])
     row = rows[test.row, test.slot]
     own = locus.test
     if own.kind in (*CORNERS, "grazing") and row <= own.row:

@@ -5,14 +5,18 @@ import abc
 import dataclasses
 from typing import Any, Self
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
-from ._course import capacity_for, EVENT, LEAST, Start
+from ._course import capacity_for, Course, EVENT, LEAST, Start
 from ._orbit_bifurcation import Origin
-from ._orbit_curve import advance, linearised, OrbitCurve
+from ._orbit_curve import advance, linearised, Look, NODES, OrbitCurve, with_parameter
 from ._orbit_trace import branch_test, circle_tests, corner_tests, CORNERS, Spot, spot_of, Test
 from ._parameter import get_parameter
+from ._system import impact
 
 
 DELTA = 1e-4  # of the differences that give the gradient of a test function, in units of the surface
@@ -59,6 +63,19 @@ def lifted(origin: Origin, path: tuple[str, ...], low: np.ndarray, high: np.ndar
     return surface, spot_of(surface, found, spot.course), test
 
 
+def impacts(curve: OrbitCurve, course: Course, row: int) -> bool:
+    """Whether a segment ends with an impact."""
+    slot = curve.model.slots[int(course.slot[row])]
+    return isinstance(curve.model.switches[slot.switch], impact) and not slot.holding
+
+
+def touches(course: Course, row: int) -> bool:
+    """Whether without a segment the orbit would only touch the surface at which it begins."""
+    before, after = (row - 1) % int(course.num), (row + 1) % int(course.num)
+    same = np.array_equal(course.mode[before], course.mode[after])
+    return same and before != row and course.ends[before] == course.ends[row] == EVENT
+
+
 def untouched(origin: Origin) -> Origin:
     """Where segments vanish because the orbit only just touches a surface, the orbit without them, cut where it
     touches: with two such segments, as symmetric orbits have them, the equations are singular, without they are not."""
@@ -66,14 +83,9 @@ def untouched(origin: Origin) -> Origin:
     course, look, n = spot.course, spot.look, int(spot.course.num)
     length = (look.end - look.begin) / float(curve.time)
 
-    def touches(i: int) -> bool:
-        before, after = (i - 1) % n, (i + 1) % n
-        same = np.array_equal(course.mode[before], course.mode[after])
-        return same and abs(length[i]) < 1e-5 and course.ends[before] == course.ends[i] == EVENT
-
-    if test.kind != "duration" or not touches(test.row):
+    if test.kind != "duration" or not touches(course, test.row):
         return origin
-    gone = [i for i in range(n) if touches(i)]
+    gone = [i for i in range(n) if touches(course, i) and abs(length[i]) < 1e-5]
     kept = [i for i in range(n) if i not in gone]
     ends, xs = np.array(course.ends), np.array(look.x)
     ends[[(i - 1) % n for i in gone]] = LEAST
@@ -120,8 +132,10 @@ class AbstractLocus(abc.ABC):
         rows = [self.watched(place) for place in places]
         names = {t for row in rows for t in row}
         silent = {t for t in names if all(abs(row.get(t, 0.0)) < ALWAYS for row in rows)}
-        if "rate" in {t.kind for t in (self.test, *silent)}:  # the saltation at a tangential event is a limit
-            silent |= {Test("flip"), Test("Neimark-Sacker")}
+        tangential = {t for t in (self.test, *silent) if t.kind == "rate"}
+        course = places[0].spot.course
+        if any(t != self.test or impacts(self.curve, course, t.row) for t in tangential):
+            silent |= {Test("flip"), Test("Neimark-Sacker")}  # which saltation matrices that are limits make no numbers
         return dataclasses.replace(self, silent=frozenset(silent))
 
 
@@ -187,7 +201,7 @@ class Locus(AbstractLocus):
 
     def watched(self, place: Place) -> dict[Test, float]:
         spot, test = place.spot, self.test
-        out = interval_tests(spot) | corner_tests(self.curve, spot)
+        out = interval_tests(spot) | corner_tests(self.curve, cleared(self.curve, spot))
         out[Test("fold")] = projection(spot)
         out[Test("branch")] = branch_test(spot, self.scale)
         out |= circle_tests(self.curve, spot)
@@ -198,11 +212,39 @@ class Locus(AbstractLocus):
             rho = spot.trivial(self.curve.autonomous)
             pairs = [(abs(a * b - 1), (a + b).real / 2) for i, a in enumerate(rho) for b in rho[:i]]
             out |= {name: min(pairs)[1] + off for name, off in RESONANCES.items()}
-        cut = np.flatnonzero(spot.course.ends[: int(spot.course.num)] == LEAST)
-        for row in cut.tolist():  # the guard that is watched there has two zeros, of no length apart
-            for beside in (row, (row + 1) % int(spot.course.num)):
-                out.pop(Test("guard", beside, int(spot.course.slot[row])), None)
         return self.told(out)
+
+
+def cleared(curve: OrbitCurve, spot: Spot) -> Spot:
+    """With the least values of guards beside cuts at which they are zero, and least, divided by that double zero."""
+    course, look, n = spot.course, spot.look, int(spot.course.num)
+    cuts = np.flatnonzero(course.ends[:n] == LEAST).tolist()
+    if not cuts:
+        return spot
+    theta = 0.5 - 0.5 * np.cos(np.pi * np.arange(NODES + 1) / NODES)
+    zeros = np.asarray(curve.zeros_at_begin(curve.model, course))
+    least, where, spots = np.array(look.least), np.array(look.where), np.array(look.spots)
+    for cut in cuts:
+        slot = int(course.slot[cut])
+        for row in {cut, (cut + 1) % n}:
+            before = row - 1 if row else n - 1
+            begins = 2 if (course.ends[before], course.slot[before]) == (LEAST, slot) else zeros[row, slot]
+            ends = {LEAST: 2, EVENT: 1}.get(int(course.ends[row]), 0) if course.slot[row] == slot else 0
+            below = theta**begins * (1 - theta) ** ends
+            values = np.asarray(_guards_along(curve, look, course, np.asarray(row)))[:, slot]
+            # Samples nearer to the double zero are rounding divided by little.
+            values = np.where(below > 1e-4, values / np.maximum(below, 1e-4), np.inf)
+            at = int(np.argmin(values))
+            least[row, slot], where[row, slot], spots[row, slot] = values[at], theta[at], look.xs[row][at]
+    return dataclasses.replace(spot, look=look._replace(least=least, where=where, spots=spots))
+
+
+@eqx.filter_jit
+def _guards_along(curve: OrbitCurve, look: Look, course: Course, row: Array) -> Array:
+    """The values of the guards at the samples of a segment."""
+    model = with_parameter(curve.model, curve.path, look.parameter)
+    state = curve.state(jnp.asarray(course.mode)[row], jnp.asarray(course.part)[row])
+    return jax.vmap(lambda t, x: jnp.max(curve.guards(model, t, x, state), axis=-1))(look.ts[row], look.xs[row])
 
 
 def interval_tests(spot: Spot) -> dict[Test, float]:
@@ -226,7 +268,7 @@ def surfaces_of(curve: OrbitCurve, spot: Spot, test: Test) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def seen_at(curve: OrbitCurve, course: Any, u: np.ndarray, border: np.ndarray) -> Spot:
+def seen_at(curve: OrbitCurve, course: Course, u: np.ndarray, border: np.ndarray) -> Spot:
     """What is seen of a point that is known to be one of the surface."""
     found = advance(curve, course, u, border, np.zeros(len(border)), u, np.asarray(False))
     return spot_of(curve, jax.device_get(found), course)

@@ -1,0 +1,259 @@
+"""Curves of special points of periodic orbits in two parameters, against closed forms and computations by scipy."""
+
+import diffrax as dfx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import Motion, pid
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.optimize import brentq, fsolve
+
+import nsjax
+from nsjax import continue_bifurcation, continue_orbit, find_orbit, gallery
+
+
+def branch_of(system, y0, parameter, interval, orbit=None, **options):
+    method = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-12), max_steps=8192, max_events=16)
+    found = find_orbit(system, y0, **(method | (orbit or {})))
+    return continue_orbit(system, found, parameter, interval, **options)
+
+
+def of_kind(branch, kind):
+    found = [b for b in branch.special_points if b.kind == kind]
+    assert found, f"no {kind} among {[b.kind for b in branch.special_points]}"
+    return found[0]
+
+
+class Duffing(nsjax.System):
+    """x'' + c x' + x + x³ = F cos ωt."""
+
+    c: float = 0.2
+    F: float = 1.0
+    omega: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, self.F * jnp.cos(self.omega * t) - self.c * y.v - y.x - y.x**3)
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+class Wall(nsjax.System):
+    """x'' + c x' + x = cos ωt, before a visco-elastic wall."""
+
+    c: float = 0.05
+    x_c: float = 4.0
+    k_f: float = 1.0
+    c_f: float = 1.0
+    omega: float = 1.15
+
+    def vector_field(self, t, y, s):
+        force = self.wall(t, y)[1] * (1 + s.wall) / 2
+        return Motion(y.v, jnp.cos(self.omega * t) - self.c * y.v - y.x - force)
+
+    @nsjax.sgn
+    def wall(self, t, y):
+        return y.x - self.x_c, self.k_f * (y.x - self.x_c) + self.c_f * y.v
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+class Meissner(nsjax.System):
+    """x'' + c x' + (δ + ε sgn(cos ωt)) x + x³ = 0: a parametric excitation that switches."""
+
+    c: float = 0.1
+    delta: float = 1.0
+    epsilon: float = 0.5
+    omega: float = 2.4
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -self.c * y.v - (self.delta + self.epsilon * s.swing) * y.x - y.x**3)
+
+    @nsjax.sgn
+    def swing(self, t, y):
+        return jnp.cos(self.omega * t)
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+def meissner(omega, epsilon=0.5, c=0.1):
+    """Trace and determinant of the monodromy matrix of x = 0."""
+    half = np.pi / omega
+    a, b = (np.sqrt(1 - c**2 / 4 + sign * epsilon) for sign in (1, -1))
+    pair = 2 * np.cos(a * half) * np.cos(b * half) - (a / b + b / a) * np.sin(a * half) * np.sin(b * half)
+    return np.exp(-c * half) * pair, np.exp(-2 * c * half)
+
+
+def duffing_map(x, v, t, omega, F):
+    """The state after a period, and the derivatives by that before."""
+
+    def rhs(t, z):
+        x, v, *columns = z
+        bend = -1 - 3 * x**2
+        change = [w for a, b in (columns[:2], columns[2:]) for w in (b, bend * a - 0.2 * b)]
+        return [v, F * np.cos(omega * t) - 0.2 * v - x - x**3, *change]
+
+    end = solve_ivp(rhs, (t, t + 2 * np.pi / omega), [x, v, 1, 0, 0, 1], method="DOP853", rtol=3e-14, atol=1e-14)
+    return end.y[:2, -1], end.y[2:, -1].reshape(2, 2).T
+
+
+def duffing_fold(z, t, F):
+    x, v, omega = z
+    end, m = duffing_map(x, v, t, omega, F)
+    return [*(end - [x, v]), np.linalg.det(np.eye(2) - m)]
+
+
+def duffing_cusp(z, t):
+    """Besides, the curvature of the map along the eigenvector of 1, seen by the left one."""
+    x, v, omega, F = z
+    _, m = duffing_map(x, v, t, omega, F)
+    left, _, right = np.linalg.svd(np.eye(2) - m)
+    h, along = 1e-4, right[-1] / np.sign(right[-1, 0])
+    (a, _), (b, _) = (duffing_map(x + s * along[0], v + s * along[1], t, omega, F) for s in (h, -h))
+    bend = (a + b - 2 * duffing_map(x, v, t, omega, F)[0]) / h**2
+    return [*duffing_fold(z[:3], t, F), left[:, -1] @ bend / np.sign(left[0, -1])]
+
+
+@pytest.fixture(scope="module")
+def duffing():
+    return branch_of(Duffing(), Motion(0.5, 0.0), "omega", (0.9, 2.4))
+
+
+def test_folds_and_cusp(duffing):
+    """Without switches: the folds of Duffing's oscillator meet in a cusp, through which the curve goes on."""
+    folds = [b for b in duffing.bifurcations if b.kind == "fold"]
+    curve = continue_bifurcation(folds[0], "F", (0.05, 1.3))
+    assert (curve.kind, curve.discontinuous, curve.parameters) == ("fold", False, ("omega", "F"))
+    assert all(len(column) == len(curve) for column in (curve.values, curve.periods, curve.multipliers, curve.ts))
+    np.testing.assert_allclose(np.abs(curve.multipliers - 1).min(axis=1), 0, atol=1e-9)
+    for i in np.linspace(1, len(curve) - 2, 4).astype(int):
+        omega, F = curve.values[i]
+        guess = [curve.ys.x[i], curve.ys.v[i], omega]
+        want = fsolve(duffing_fold, guess, (curve.ts[i], F), xtol=1e-13)
+        np.testing.assert_allclose(omega, want[2], atol=1e-9)
+    # Both folds of the branch are on the curve.
+    both = sorted(omega for omega, F in curve.values if abs(F - 1) < 1e-9)
+    assert any(abs(omega - folds[0].value) < 1e-9 for omega in both)
+    other = continue_bifurcation(folds[1], "F", (0.05, 1.3))
+    (cusp,), (same,) = curve.special, other.special
+    assert cusp.name == same.name == "cusp"
+    np.testing.assert_allclose(cusp.values, same.values, atol=1e-10)
+    want = fsolve(duffing_cusp, [cusp.y.x, cusp.y.v, *cusp.values], cusp.t, xtol=1e-12)
+    np.testing.assert_allclose(cusp.values, want[2:], atol=1e-9)
+    assert set(curve.ends) == {"F = 1.3", "omega = 2.4"} and "cusp at omega = " in str(curve)
+    ax = nsjax.plot.parameter_plane(curve, labels={"omega": "ω [rad/s]"})
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("ω [rad/s]", "F") and [t.get_text() for t in ax.texts] == ["cusp"]
+
+
+@pytest.mark.slow
+def test_fold_meets_grazing():
+    """The linear response touches the wall where its amplitude is the distance. The fold of the orbits with contact
+    ends there where their multiplier, with the limit of the saltation matrix, is 1."""
+    branch = branch_of(Wall(), Motion(-3.0, 0.0), "omega", (1.05, 1.35))
+    corner, fold = (next(b for b in branch.bifurcations if b.discontinuous == d) for d in (True, False))
+    grazing, folds = (continue_bifurcation(b, "x_c", (0.5, 12.0)) for b in (corner, fold))
+    omega, x_c = grazing.values.T
+    np.testing.assert_allclose(np.abs(1 - omega**2 + 0.05j * omega) * x_c, 1, atol=1e-10)
+    assert grazing.name == "grazing of wall" and grazing.discontinuous and len(grazing) > 50
+
+    def multiplier_one(omega, c=0.05, c_f=1.0):
+        e, rate = np.exp(-c * np.pi / omega), np.sqrt(1 - c**2 / 4)
+        angle = 2 * np.pi * rate / omega
+        return 1 - 2 * e * np.cos(angle) + c_f * e * np.sin(angle) / rate + e**2
+
+    at = brentq(multiplier_one, 1.1, 1.2, xtol=1e-15)
+    cusp, end = sorted(folds.special, key=lambda p: p.name)
+    assert (cusp.name, end.name) == ("cusp", "fold at a grazing of wall") and "a grazing of wall" in folds.ends
+    np.testing.assert_allclose(end.values, [at, 1 / abs(1 - at**2 + 0.05j * at)], atol=1e-10)
+    np.testing.assert_allclose(end.multipliers, [1, np.exp(-0.05 * 2 * np.pi / at)], atol=1e-6)
+    # A fold at another distance of the wall, found anew.
+    i = np.argmin(np.abs(folds.values[:, 1] - 3.3))
+    value, distance = folds.values[i]
+    again = branch_of(Wall(x_c=float(distance)), Motion(-2.0, 0.0), "omega", (1.05, 1.35))
+    assert min(abs(b.value - value) for b in again.bifurcations if b.kind == "fold") < 1e-9
+
+
+@pytest.mark.slow
+def test_flips():
+    branch = branch_of(Meissner(), Motion(0.0, 0.0), "omega", (2.2, 2.5), scale=Motion(1.0, 1.0), max_laps=1)
+    curve = continue_bifurcation(of_kind(branch, "flip"), "epsilon", (0.05, 0.9), first=(1.0, 4.0))
+    trace, square = meissner(*curve.values.T)
+    np.testing.assert_allclose(1 + trace + square, 0, atol=1e-10)
+    assert curve.ends == ("epsilon = 0.9",) * 2 and np.ptp(curve.values[:, 0]) > 1  # both sides of the resonance
+
+
+@pytest.mark.slow
+def test_neimark_sacker_and_resonances():
+    """Without damping x = 0 has multipliers on the unit circle, until these meet at -1."""
+    branch = branch_of(
+        Meissner(omega=3.0), Motion(0.0, 0.0), "c", (-0.1, 0.15), scale=Motion(1.0, 1.0), max_laps=1
+    )  # fmt: skip
+    curve = continue_bifurcation(of_kind(branch, "Neimark-Sacker"), "omega", (0.6, 5.0))
+    np.testing.assert_allclose(curve.values[:, 0], 0, atol=1e-11)
+    assert curve.ends == ("1:2 resonance", "omega = 5") or curve.ends == ("omega = 5", "1:2 resonance")
+    cosines = {"1:2 resonance": (-2, 2.2, 2.4), "1:3 resonance": (-1, 2.9, 3.2), "1:4 resonance": (0, 3.9, 4.2)}
+    assert sorted(p.name for p in curve.special) == sorted(cosines)
+    for point in curve.special:
+        trace, *between = cosines[point.name]
+        want = brentq(lambda omega, trace=trace: meissner(omega, c=0.0)[0] - trace, *between, xtol=1e-14)
+        np.testing.assert_allclose(point.values, [0, want], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_symmetry_breaking():
+    """Where x = 0 has the multiplier 1: at every point of the curve the equations of the orbits are singular."""
+    branch = branch_of(
+        Meissner(omega=1.1), Motion(0.0, 0.0), "omega", (0.98, 1.15), scale=Motion(1.0, 1.0), max_laps=1
+    )  # fmt: skip
+    curve = continue_bifurcation(of_kind(branch, "symmetry breaking"), "epsilon", (0.05, 0.9), first=(0.6, 2.0))
+    trace, square = meissner(*curve.values.T)
+    np.testing.assert_allclose(1 - trace + square, 0, atol=1e-9)
+    assert curve.ends == ("epsilon = 0.9",) * 2 and not curve.discontinuous
+
+
+def slip(tau, c, x, v):
+    """The damped oscillator x'' + c x' + x = 0 after this time."""
+    return expm(np.array([[0.0, 1.0], [-1.0, -c]]) * tau) @ [x, v]
+
+
+@pytest.mark.slow
+def test_infinitely_unstable_folds():
+    """Section 6.7: the mass comes back to the belt just as the belt could hold it with the slip force."""
+    branch = branch_of(
+        gallery.StickSlip(c=0.1, v_dr=0.5), Motion(2.0, 0.0), "v_dr", (0.4, 1.3), dict(period=8.0)
+    )  # fmt: skip
+    curve = continue_bifurcation(of_kind(branch, "infinitely unstable fold"), "c", (0.03, 0.4), first=(0.1, 4.0))
+    assert curve.name == "tangency of belt" and np.ptp(curve.values[:, 1]) > 0.3
+    for (v_dr, c), period in zip(curve.values[::8], curve.periods[::8]):
+
+        def equations(z, c=c):
+            v, tau = z
+            return slip(tau, c, 1 - c * v, v) - [-c * v, v]
+
+        tau = period - 1 / v_dr  # on the belt it moves from one force to the other
+        np.testing.assert_allclose(fsolve(equations, [v_dr, tau], xtol=1e-14)[0], v_dr, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(parameter="omega"), "another one than that of the branch"),
+        (dict(parameter="speed"), "must be one of"),
+        (dict(interval=(1.5, 2.0)), "must be \\(low, high\\) and hold 1"),
+        (dict(first=(0.5, 0.6)), "`first` must be \\(low, high\\)"),
+    ],
+)
+def test_mistakes(duffing, change, message):
+    with pytest.raises(ValueError, match=message):
+        continue_bifurcation(duffing.bifurcations[0], **(dict(parameter="F", interval=(0.5, 1.5)) | change))
+
+
+def test_a_loaded_point(duffing):
+    with pytest.raises(ValueError, match="loaded from a file"):
+        continue_bifurcation(duffing.bifurcations[0]._replace(origin=None), "F", (0.5, 1.5))
