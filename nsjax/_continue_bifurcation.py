@@ -10,10 +10,11 @@ from jaxtyping import Complex, Float
 
 from ._continue_orbit import CLOSED
 from ._orbit_bifurcation import OrbitBifurcation
+from ._orbit_corner import is_impact
 from ._orbit_curve import OrbitCurve
 from ._orbit_locus import LAST, Met, trace, Trail
 from ._orbit_singular import BranchLocus
-from ._orbit_surface import CUSP, impacts, lifted, Locus, RESONANCES, surfaces_of, touches
+from ._orbit_surface import CUSP, lifted, Locus, RESONANCES, surfaces_of, touches
 from ._orbit_trace import CORNERS, midpoint, Spot, Test
 from ._parameter import get_parameter, parameter_path
 from ._system import System
@@ -233,7 +234,7 @@ def _kind(curve: OrbitCurve, spot: Spot, special: OrbitBifurcation, test: Test) 
 def _touching(curve: OrbitCurve, spot: Spot, test: Test) -> str:
     """How the orbit meets a surface at a corner."""
     if test.kind == "rate":
-        return "grazing" if impacts(curve, spot.course, test.row) else "tangency"
+        return "grazing" if is_impact(curve, spot, test.row) else "tangency"
     if test.kind == "duration" and touches(spot.course, test.row):
         return "grazing"
     return "grazing" if test.kind in ("guard", "grazing") else "corner"
@@ -243,6 +244,9 @@ def _name(curve: OrbitCurve, kind: str, met: Met) -> str:
     test = met.test
     if test.kind in (*CORNERS, "grazing"):
         touched = ", ".join(surfaces_of(curve, met.spot, test))
+        if kind in ("grazing", "tangency", "corner"):
+            other = _touching(curve, met.spot, test)
+            return f"double {kind}" if other == kind else f"{kind} and {other} of {touched}"
         return f"{kind} at a {_touching(curve, met.spot, test)} of {touched}"
     if test == CUSP or test in RESONANCES:
         return test.kind

@@ -54,7 +54,7 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
     alike = ("duration", "margin") if kind in ("duration", "margin") else (kind,)
     kinds = {t.row: t.kind for t in (*zero.others, zero.test) if t.kind in alike}
     rows = list(kinds)
-    bounces = kind == "rate" and all(_is_impact(curve, spot, row) for row in rows)
+    bounces = kind == "rate" and all(is_impact(curve, spot, row) for row in rows)
     if kind == "rate" and not bounces:
         node = repelled_at(tracer, name, spot, rows)
         return node or _end(tracer, name, zero)
@@ -110,7 +110,7 @@ def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple
     return once, zero._replace(spot=spot, test=tests[0], others=tuple(tests[1:]))
 
 
-def _is_impact(curve: OrbitCurve, spot: Spot, row: int) -> bool:
+def is_impact(curve: OrbitCurve, spot: Spot, row: int) -> bool:
     """Whether a segment ends with an impact: one that becomes a grazing does nothing any more."""
     slot = curve.model.slots[int(spot.course.slot[row])]
     return isinstance(curve.model.switches[slot.switch], impact) and not slot.holding

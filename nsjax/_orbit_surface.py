@@ -16,7 +16,6 @@ from ._orbit_bifurcation import Origin
 from ._orbit_curve import advance, linearised, Look, NODES, OrbitCurve, with_parameter
 from ._orbit_trace import branch_test, circle_tests, corner_tests, CORNERS, Spot, spot_of, Test
 from ._parameter import get_parameter
-from ._system import impact
 
 
 DELTA = 1e-4  # of the differences that give the gradient of a test function, in units of the surface
@@ -61,12 +60,6 @@ def lifted(origin: Origin, path: tuple[str, ...], low: np.ndarray, high: np.ndar
     newton = np.asarray(test.kind != "branch")  # where the equations are singular it is as exact as it gets
     found = advance(surface, spot.course, u, border, np.zeros(2), u, newton)
     return surface, spot_of(surface, found, spot.course), test
-
-
-def impacts(curve: OrbitCurve, course: Course, row: int) -> bool:
-    """Whether a segment ends with an impact."""
-    slot = curve.model.slots[int(course.slot[row])]
-    return isinstance(curve.model.switches[slot.switch], impact) and not slot.holding
 
 
 def touches(course: Course, row: int) -> bool:
@@ -132,10 +125,8 @@ class AbstractLocus(abc.ABC):
         rows = [self.watched(place) for place in places]
         names = {t for row in rows for t in row}
         silent = {t for t in names if all(abs(row.get(t, 0.0)) < ALWAYS for row in rows)}
-        tangential = {t for t in (self.test, *silent) if t.kind == "rate"}
-        course = places[0].spot.course
-        if any(t != self.test or impacts(self.curve, course, t.row) for t in tangential):
-            silent |= {Test("flip"), Test("Neimark-Sacker")}  # which saltation matrices that are limits make no numbers
+        if "rate" in {t.kind for t in (self.test, *silent)}:
+            silent |= {Test("flip"), Test("Neimark-Sacker")}  # saltation matrices that are limits make them no numbers
         return dataclasses.replace(self, silent=frozenset(silent))
 
 
@@ -146,8 +137,8 @@ class Locus(AbstractLocus):
     def at(self, spot: Spot, s: np.ndarray, guess: np.ndarray | None = None) -> Spot:
         """The point of the surface at these distances along the frame of the tangent plane at another."""
         look = spot.look
-        guess = look.u + s @ look.tangent if guess is None else guess
-        found = advance(self.curve, spot.course, look.u, look.tangent, s, guess, np.asarray(True))
+        start = look.u + s @ look.tangent if guess is None else guess
+        found = advance(self.curve, spot.course, look.u, look.tangent, s, start, np.asarray(True))
         if not bool(found.good):
             raise ArithmeticError("there is no orbit")
         return spot_of(self.curve, found, spot.course)

@@ -1,5 +1,9 @@
 """Curves of special points of periodic orbits in two parameters, against closed forms and computations by scipy."""
 
+import pathlib
+import re
+from typing import Any
+
 import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +14,7 @@ from scipy.linalg import expm
 from scipy.optimize import brentq, fsolve
 
 import nsjax
-from nsjax import continue_bifurcation, continue_orbit, find_orbit, gallery
+from nsjax import continue_bifurcation, continue_orbit, find_orbit
 
 
 def branch_of(system, y0, parameter, interval, orbit=None, **options):
@@ -62,6 +66,28 @@ class Wall(nsjax.System):
         return 2 * jnp.pi / self.omega
 
 
+class Twice(nsjax.System):
+    """x'' + c x' + x = cos ωt + a cos(3ωt + φ), before an elastic wall: two crests in a period."""
+
+    c: float = 0.1
+    a: float = 0.3
+    phi: float = 1.0 + np.pi
+    x_c: float = 1.7
+    omega: float = 0.42
+
+    def vector_field(self, t, y, s):
+        force = jnp.cos(self.omega * t) + self.a * jnp.cos(3 * self.omega * t + self.phi)
+        return Motion(y.v, force - self.c * y.v - y.x - 2 * (y.x - self.x_c) * (1 + s.wall) / 2)
+
+    @nsjax.sgn
+    def wall(self, t, y):
+        return y.x - self.x_c
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
 class Meissner(nsjax.System):
     """x'' + c x' + (δ + ε sgn(cos ωt)) x + x³ = 0: a parametric excitation that switches."""
 
@@ -88,6 +114,10 @@ def meissner(omega, epsilon=0.5, c=0.1):
     a, b = (np.sqrt(1 - c**2 / 4 + sign * epsilon) for sign in (1, -1))
     pair = 2 * np.cos(a * half) * np.cos(b * half) - (a / b + b / a) * np.sin(a * half) * np.sin(b * half)
     return np.exp(-c * half) * pair, np.exp(-2 * c * half)
+
+
+def root(function, low, high):
+    return float(np.asarray(brentq(function, low, high, xtol=1e-15)))
 
 
 def duffing_map(x, v, t, omega, F):
@@ -167,7 +197,7 @@ def test_fold_meets_grazing():
         angle = 2 * np.pi * rate / omega
         return 1 - 2 * e * np.cos(angle) + c_f * e * np.sin(angle) / rate + e**2
 
-    at = brentq(multiplier_one, 1.1, 1.2, xtol=1e-15)
+    at = root(multiplier_one, 1.1, 1.2)
     cusp, end = sorted(folds.special, key=lambda p: p.name)
     assert (cusp.name, end.name) == ("cusp", "fold at a grazing of wall") and "a grazing of wall" in folds.ends
     np.testing.assert_allclose(end.values, [at, 1 / abs(1 - at**2 + 0.05j * at)], atol=1e-10)
@@ -177,6 +207,31 @@ def test_fold_meets_grazing():
     value, distance = folds.values[i]
     again = branch_of(Wall(x_c=float(distance)), Motion(-2.0, 0.0), "omega", (1.05, 1.35))
     assert min(abs(b.value - value) for b in again.bifurcations if b.kind == "fold") < 1e-9
+
+
+@pytest.mark.slow
+def test_double_grazing():
+    """Where both crests of the linear response touch the wall, its curve of grazings ends."""
+    branch = branch_of(Twice(), Motion(0.0, 0.0), "omega", (0.39, 0.45))
+    curve = continue_bifurcation(branch.special_points[0], "x_c", (1.0, 12.0), first=(0.25, 0.5))
+
+    def response(angle, omega, derivative=0):
+        parts = [(1, 1.0), (3, 0.3 * np.exp(1j * (1.0 + np.pi)))]
+        lines = [(k * 1j) ** derivative * a * np.exp(1j * k * angle) / (1 - (k * omega) ** 2 + 0.1j * k * omega)
+                 for k, a in parts]  # fmt: skip
+        return np.real(sum(lines))
+
+    def equations(z):
+        first, second, omega = z
+        return [response(first, omega, 1), response(second, omega, 1), response(first, omega) - response(second, omega)]
+
+    crest, _, omega = fsolve(equations, [5.3, 1.05, 0.325], xtol=1e-13)
+    (point,) = curve.special
+    assert point.name == "double grazing" and "a grazing of wall" in curve.ends
+    np.testing.assert_allclose(point.values, [omega, response(crest, omega)], atol=1e-9)
+    angles = np.linspace(0, 2 * np.pi, 20001)
+    heights = [np.max(response(angles, omega)) for omega in curve.values[:, 0]]
+    np.testing.assert_allclose(curve.values[:, 1], heights, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -201,7 +256,7 @@ def test_neimark_sacker_and_resonances():
     assert sorted(p.name for p in curve.special) == sorted(cosines)
     for point in curve.special:
         trace, *between = cosines[point.name]
-        want = brentq(lambda omega, trace=trace: meissner(omega, c=0.0)[0] - trace, *between, xtol=1e-14)
+        want = root(lambda omega, trace=trace: meissner(omega, c=0.0)[0] - trace, *between)
         np.testing.assert_allclose(point.values, [0, want], atol=1e-9)
 
 
@@ -224,12 +279,16 @@ def slip(tau, c, x, v):
 
 @pytest.mark.slow
 def test_infinitely_unstable_folds():
-    """Section 6.7: the mass comes back to the belt just as the belt could hold it with the slip force."""
-    branch = branch_of(
-        gallery.StickSlip(c=0.1, v_dr=0.5), Motion(2.0, 0.0), "v_dr", (0.4, 1.3), dict(period=8.0)
-    )  # fmt: skip
-    curve = continue_bifurcation(of_kind(branch, "infinitely unstable fold"), "c", (0.03, 0.4), first=(0.1, 4.0))
+    """Section 6.7, as README has it: the mass comes back to the belt just as this could hold it with the slip force."""
+    blocks = re.findall(
+        r"```python\n(.*?)```", (pathlib.Path(__file__).parents[1] / "README.md").read_text(), re.DOTALL
+    )
+    (block,) = [b for b in blocks if "continue_bifurcation" in b]
+    shown: dict[str, Any] = dict(nsjax=nsjax)
+    exec(block, shown)
+    curve = shown["curve"]
     assert curve.name == "tangency of belt" and np.ptp(curve.values[:, 1]) > 0.3
+    assert np.isnan(curve.multipliers).all()  # they are limits
     for (v_dr, c), period in zip(curve.values[::8], curve.periods[::8]):
 
         def equations(z, c=c):

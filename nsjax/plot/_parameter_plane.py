@@ -17,6 +17,8 @@ COLORS = {
     "fold": "C0", "flip": "C2", "Neimark-Sacker": "C4", "symmetry breaking": "C9", "transcritical": "C8",
     "branch point": "C7", "grazing": "C3", "corner": "C1", "tangency": "C5",
 }  # fmt: skip
+NEAR = 0.03  # points that are nearer, in axes, are named together
+Word = tuple[float, float, str]
 POINT = dict(marker="o", linestyle="none", color="black", markersize=5.5, zorder=4)
 
 
@@ -53,7 +55,7 @@ def parameter_plane(
                 f"{(first, second)}."
             )
     ax = axes_or_new(ax)
-    words = []
+    words: list[Word] = []
     for curve in curves:
         order = [curve.parameters.index(name) for name in (first, second)]
         x, y = curve.values[:, order].T
@@ -62,15 +64,26 @@ def parameter_plane(
         for point in curve.special:
             at = np.asarray(point.values)[order]
             ax.plot(at[:1], at[1:], **POINT)
-            text = names(point) if callable(names) else point.name.replace(" at ", "\nat ") if names else ""
+            text = names(point) if callable(names) else point.name if names else ""
             words.append((float(at[0]), float(at[1]), text))
     ax.margins(0.08, 0.1)
-    (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
-    # Curves that meet name their point each; it is written once.
-    places = {(round(200 * x / (right - left)), round(200 * y / (high - low))): (x, y, t) for x, y, t in words[::-1]}
-    write_names(ax, [place for place in places.values() if place[2]])
+    write_names(ax, _together(words, np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())))
     ax.set_xlabel(axis_label(labels, first))
     ax.set_ylabel(axis_label(labels, second))
     if legend:
         add_legend(ax)
     return ax
+
+
+def _together(words: list[Word], width: float, height: float) -> list[Word]:
+    """Names of points that lie close together, one below the other; curves that meet name their point each."""
+    groups: list[list[Word]] = []
+    for word in words:
+        x, y, text = word
+        near = (g for g in groups if abs(g[0][0] - x) < NEAR * width and abs(g[0][1] - y) < NEAR * height)
+        group = next(near, None)
+        if group is None:
+            groups.append([word])
+        elif text not in [other[2] for other in group]:
+            group.append(word)
+    return [(g[0][0], g[0][1], "\n".join(w[2] for w in g)) for g in groups if g[0][2]]
