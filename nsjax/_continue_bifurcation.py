@@ -12,7 +12,7 @@ from ._continue_orbit import CLOSED
 from ._orbit_bifurcation import OrbitBifurcation
 from ._orbit_corner import is_impact
 from ._orbit_curve import OrbitCurve
-from ._orbit_locus import LAST, Met, trace, Trail
+from ._orbit_locus import FAILED, LAST, Met, trace, Trail
 from ._orbit_singular import BranchLocus
 from ._orbit_surface import CUSP, lifted, Locus, RESONANCES, surfaces_of, touches
 from ._orbit_trace import CORNERS, midpoint, Spot, Test
@@ -174,15 +174,16 @@ def continue_bifurcation(
     locus = kind_of_locus(surface, test, float(spot.look.branch[1]))
     try:
         place = locus.place(spot)
+        place = locus.place(locus.step(place, 0.0), place.along, place.heading)
         near = [locus.place(locus.step(place, s), place.along, place.heading) for s in (1e-3, -1e-3)]
-    except (ArithmeticError, KeyError) as why:
+    except FAILED as why:
         raise ValueError(
             f"Argument `special` must lie on a curve of such points in {special.parameter} and {parameter}, but beside "
             f"this {special.name} none was found: {why}."
         ) from why
     locus = locus.heard([place, *near])
     ahead = trace(locus, place, max_step, max_points)
-    back = Trail([spot]) if ahead.closed else trace(locus, place.turned, max_step, max_points)
+    back = Trail([place.spot]) if ahead.closed else trace(locus, place.turned, max_step, max_points)
     names = (special.parameter, parameter)
     kind, surfaces = _kind(surface, spot, special, test)
     spots = back.spots[:0:-1] + ahead.spots

@@ -24,6 +24,9 @@ class Origin(NamedTuple):
     spot: Spot
     curve: OrbitCurve
 
+    def __repr__(self) -> str:
+        return f"Origin({self.test.kind})"
+
 
 class OrbitHalf(NamedTuple):
     """A branch on one side of a special point.

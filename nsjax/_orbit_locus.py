@@ -13,6 +13,7 @@ from ._orbit_surface import AbstractLocus, cleared, CUSP, DELTA, Locus, Place, R
 from ._orbit_trace import CORNERS, FIRST, SHORTEST, Spot, Test, TURN
 
 
+FAILED = (ArithmeticError, KeyError, np.linalg.LinAlgError)  # where an orbit, or what is asked of it, is not found
 TOGETHER = 1e-3  # zeros that are nearer to each other, in steps, are one
 DEGENERATE = 1e-2  # of the slope of the test function: where it is less, two branches of its zeros cross
 # What vanishes together is told by the first. (At a resonance multipliers also pass 1 or -1.)
@@ -50,7 +51,7 @@ def trace(locus: AbstractLocus, place: Place, max_step: float, max_points: int) 
             if turn > 0.5:
                 raise ArithmeticError("it turns too much")
             found = _met(locus, place, after, length)
-        except ArithmeticError:
+        except FAILED:
             length /= 2
             if length < SHORTEST:
                 out.why = "the last orbit that could be found"
@@ -137,7 +138,7 @@ def _located(locus: AbstractLocus, place: Place, length: float, test: Test) -> M
             # Where the zeros of the test function cross others of its own, as at a corner at which the orbits turn
             # round with it, points of the curve are known less and less well.
             regular = locus.place(seen[s], place.along).slope > DEGENERATE * place.slope
-    except (ArithmeticError, KeyError):
+    except FAILED:
         regular = False
     if not regular:
         near = min(seen, key=lambda t: abs(t - s))
@@ -159,7 +160,7 @@ def _interpolated(
         try:
             here = locus.step(place, s + 0.5 * length * share)
             values.append(value(s + 0.5 * length * share))
-        except (ArithmeticError, KeyError):
+        except FAILED:
             continue
         shares.append(share)
         spots.append(here)
@@ -195,7 +196,7 @@ def _cut(locus: Locus, spot: Spot, test: Test) -> Spot | None:
         first, second = (dataclasses.replace(locus, test=t) for t in (own, Test("grazing", row)))
         rough = seen_at(locus.curve, start.course, u, border)
         return meet(first, second, first.at(rough, np.zeros(2)))
-    except (ArithmeticError, np.linalg.LinAlgError):
+    except FAILED:
         return None
 
 

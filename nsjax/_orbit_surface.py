@@ -75,7 +75,6 @@ def untouched(origin: Origin) -> Origin:
     test, spot, curve = origin
     course, look, n = spot.course, spot.look, int(spot.course.num)
     length = (look.end - look.begin) / float(curve.time)
-
     if test.kind != "duration" or not touches(course, test.row):
         return origin
     gone = [i for i in range(n) if touches(course, i) and abs(length[i]) < 1e-5]
@@ -177,7 +176,7 @@ class Locus(AbstractLocus):
         value = self.value(spot)
         for _ in range(12):
             move = -value / slope
-            if not abs(c + move) <= 0.5 * abs(length) + 1e-9:
+            if not abs(c + move) <= 0.5 * abs(length) + 1e-6:
                 raise ArithmeticError("the curve bends too much for the step")
             c += move
             spot = self.at(place.spot, length * ahead + c * across, spot.look.u + move * place.across)

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from scipy.optimize import brentq, fsolve
 
 import nsjax
-from nsjax import continue_bifurcation, continue_orbit, find_orbit
+from nsjax import continue_bifurcation, continue_orbit, find_orbit, gallery
 
 
 def branch_of(system, y0, parameter, interval, orbit=None, **options):
@@ -165,7 +165,7 @@ def test_folds_and_cusp(duffing):
     for i in np.linspace(1, len(curve) - 2, 4).astype(int):
         omega, F = curve.values[i]
         guess = [curve.ys.x[i], curve.ys.v[i], omega]
-        want = fsolve(duffing_fold, guess, (curve.ts[i], F), xtol=1e-13)
+        want = fsolve(duffing_fold, guess, (curve.ts[i], F), xtol=1e-12)
         np.testing.assert_allclose(omega, want[2], atol=1e-9)
     # Both folds of the branch are on the curve.
     both = sorted(omega for omega, F in curve.values if abs(F - 1) < 1e-9)
@@ -225,7 +225,7 @@ def test_double_grazing():
         first, second, omega = z
         return [response(first, omega, 1), response(second, omega, 1), response(first, omega) - response(second, omega)]
 
-    crest, _, omega = fsolve(equations, [5.3, 1.05, 0.325], xtol=1e-13)
+    crest, _, omega = fsolve(equations, [5.3, 1.05, 0.325], xtol=1e-12)
     (point,) = curve.special
     assert point.name == "double grazing" and "a grazing of wall" in curve.ends
     np.testing.assert_allclose(point.values, [omega, response(crest, omega)], atol=1e-9)
@@ -296,7 +296,7 @@ def test_infinitely_unstable_folds():
             return slip(tau, c, 1 - c * v, v) - [-c * v, v]
 
         tau = period - 1 / v_dr  # on the belt it moves from one force to the other
-        np.testing.assert_allclose(fsolve(equations, [v_dr, tau], xtol=1e-14)[0], v_dr, atol=1e-9)
+        np.testing.assert_allclose(fsolve(equations, [v_dr, tau], xtol=1e-12)[0], v_dr, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -316,3 +316,18 @@ def test_mistakes(duffing, change, message):
 def test_a_loaded_point(duffing):
     with pytest.raises(ValueError, match="loaded from a file"):
         continue_bifurcation(duffing.bifurcations[0]._replace(origin=None), "F", (0.5, 1.5))
+
+
+@pytest.mark.slow
+def test_contacts_that_vanish_by_symmetry():
+    """Section 6.6, ω_A reached from the orbits with contact, of which both contacts vanish at once: up to the resonance
+    and down its other side the linear response has the amplitude of the distance."""
+    system = gallery.Trilinear(omega=0.95)
+    branch = branch_of(system, gallery.entry("6.6").orbit.y0, "omega", (0.85, 1.0))
+    (corner,) = branch.special_points
+    assert corner.kind == "none" and corner.origin.test.kind == "duration"
+    curve = continue_bifurcation(corner, "x_c", (0.3, 6.0), first=(0.3, 1.6))
+    omega, x_c = curve.values.T
+    np.testing.assert_allclose(np.abs(1 - omega**2 + 0.05j * omega) * x_c, 0.2, atol=1e-10)
+    assert np.min(omega) < 0.9 and np.max(omega) > 1.1 and np.max(x_c) > 3.9
+    assert curve.kind == "grazing" and set(curve.surfaces) == {"lower", "upper"}
