@@ -36,7 +36,16 @@ def table(*classes: type) -> Types:
     return {cls.__name__: cls for cls in classes}
 
 
-def save(path: Any, kind: str, types: Types, system: System, y: Y, parts: Mapping[str, Any], **forms: Any) -> None:
+def save(
+    path: Any,
+    kind: str,
+    types: Types,
+    system: System,
+    y: Y,
+    parts: Mapping[str, Any],
+    without: tuple[type, ...] = (),
+    **forms: Any,
+) -> None:
     """Writes a file, in the place of an older one only when it is complete.
 
     **Arguments:**
@@ -44,11 +53,11 @@ def save(path: Any, kind: str, types: Types, system: System, y: Y, parts: Mappin
     - `kind`: what it holds, a name.
     - `types`: of the objects that may occur, NamedTuples and dataclasses, by name.
     - `system`, `y`: the model, and a state of it.
-    - `parts`: what to write, by name.
+    - `parts`: what to write, by name. `without`: types of objects that are left out, None taking their place.
     - `forms`: further objects of which the reader will have the like: only the leaves of such are written.
     """
     system = arrays_of(system, np.float64)
-    encoder = _Encoder(types, dict(system=system, y=y, **forms))
+    encoder = _Encoder(types, without, dict(system=system, y=y, **forms))
     header = dict(
         format=FORMAT,
         kind=kind,
@@ -170,7 +179,8 @@ class Archive:
 class _Encoder:
     """Makes JSON of objects, and collects their arrays."""
 
-    def __init__(self, types: Types, forms: Mapping[str, Any]):
+    def __init__(self, types: Types, without: tuple[type, ...], forms: Mapping[str, Any]):
+        self.without = without
         self.names = {cls: name for name, cls in types.items()}
         self.forms = {name: form for name, tree in forms.items() if (form := jax.tree.structure(tree)) != LEAF}
         self.objects: list[Any] = []
@@ -179,7 +189,9 @@ class _Encoder:
         self.known: dict[int, tuple[Any, Any]] = {}  # with what it is, which must live as long as its id is used
 
     def encode(self, value: Any) -> Any:
-        if value is None or type(value) in (bool, int, str):
+        if value is None or isinstance(value, self.without):
+            return None
+        if type(value) in (bool, int, str):
             return value
         if type(value) is float:
             return value if np.isfinite(value) else ["float", str(value)]

@@ -8,7 +8,7 @@ import jax.flatten_util as jfu
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ._continue_orbit import CLOSED
+from ._branch import CLOSED
 from ._orbit_bifurcation import OrbitBifurcation
 from ._orbit_corner import is_impact
 from ._orbit_curve import OrbitCurve

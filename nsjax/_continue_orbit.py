@@ -14,6 +14,7 @@ from ._arcs import model_of
 from ._course import Course
 from ._cycles import Cycle
 from ._orbit import Orbit
+from ._orbit_bifurcation import Origin
 from ._orbit_branch import orbit_branch, OrbitBranch, OrbitStrand, Point, TYPES as OF_BRANCHES
 from ._orbit_curve import Look, OrbitCurve
 from ._orbit_node import Half, itinerary, Node
@@ -30,7 +31,7 @@ from ._types import Y
 GIVEN = ("model", "path", "like", "how")  # what of a curve follows from the model, and is not saved
 TYPES = {
     **OF_BRANCHES,
-    **table(OrbitTree, Walk, Exit, Arc, Zero, Test, Spot, Look, Course, Node, Half, Cycle, OrbitStrand, Point),
+    **table(OrbitTree, Walk, Origin, Exit, Arc, Zero, Test, Spot, Look, Course, Node, Half, Cycle, OrbitStrand, Point),
 }
 
 

@@ -16,7 +16,7 @@ from ._course import FREE, LEAST, TIME
 from ._cuts import Segment
 from ._find_orbit import find_orbit
 from ._orbit import Orbit
-from ._orbit_bifurcation import OrbitBifurcation, OrbitHalf
+from ._orbit_bifurcation import OrbitBifurcation, OrbitHalf, Origin
 from ._orbit_curve import OrbitCurve
 from ._orbit_record import states_of
 from ._orbit_trace import midpoint, Spot
@@ -26,7 +26,6 @@ from ._system import System
 from ._types import Y
 
 
-CLOSED = "the start: it is closed"
 NOT_BIFURCATIONS = ("none", "end")
 
 
@@ -125,7 +124,9 @@ class OrbitBranch(eqx.Module):
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes the branch and the others to a file, an `.npz` of plain arrays with a description in JSON."""
-        save(path, "OrbitBranch", TYPES, self.system, jax.tree.map(lambda x: x[0], self.ys), {"branch": self})
+        save(
+            path, "OrbitBranch", TYPES, self.system, jax.tree.map(lambda x: x[0], self.ys), {"branch": self}, (Origin,)
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike, system: System, y: Y | None = None) -> "OrbitBranch":

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ._branch import CLOSED
 from ._orbit_bifurcation import OrbitBifurcation
-from ._orbit_branch import CLOSED, OrbitStrand, Point
+from ._orbit_branch import OrbitStrand, Point
 from ._orbit_corner import node_at
 from ._orbit_curve import OrbitCurve
 from ._orbit_grazing import grazing_at
