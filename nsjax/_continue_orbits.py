@@ -13,11 +13,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ._course import capacity_for, Course, Start, start_of
+from ._find_orbit import find_orbit
 from ._orbit import Orbit
 from ._orbit_curve import OrbitCurve
 from ._orbit_lane import ENDED, follow_lane, Lane, LOST, names, NO_ORBIT, PASSED
 from ._orbit_start import check_precision, curve_and_start, options, phase_of
-from ._parameter import get_parameter, parameter_path
+from ._parameter import get_parameter, parameter_path, put_parameter
 from ._solution import is_okay
 from ._sweep import sweep
 from ._system import arrays_of, System
@@ -32,7 +33,8 @@ class OrbitBranches(eqx.Module):
 
     - `systems`: the models, their leaves with a leading axis for lanes. `parameter`: the name of the one that varies.
     - `values`: of the parameter, shape `(lanes, points)`, along each branch, upwards at the start.
-    - `periods`, `ts`, `ys`: periods [time], a time and the state of each orbit then.
+    - `periods`, `ts`, `ys`: periods [time], a time and the state of each orbit then, away from events.
+    - `orders`: of each lane the periods over that of the forcing; ones if there is none.
     - `low`, `high`: of each component of the state along the orbit.
     - `multipliers`: shape `(lanes, points, n)`, largest modulus first. `stable`: whether the orbits are.
     - `kinds`: what each point is, as text: "" for an ordinary one, "fold", "flip", "Neimark-Sacker", "branch point";
@@ -50,6 +52,7 @@ class OrbitBranches(eqx.Module):
     periods: Float[np.ndarray, "lanes points"]
     ts: Float[np.ndarray, "lanes points"]
     ys: Y
+    orders: Int[np.ndarray, " lanes"]
     low: Y
     high: Y
     multipliers: Complex[np.ndarray, "lanes points n"]
@@ -61,6 +64,21 @@ class OrbitBranches(eqx.Module):
 
     def __len__(self) -> int:
         return len(self.values)
+
+    def system_at(self, lane: int, point: int) -> System:
+        """The model at a point of a branch."""
+        system = jax.tree.map(lambda x: jnp.asarray(x[lane]), self.systems)
+        return put_parameter(system, parameter_path(system, self.parameter), jnp.asarray(self.values[lane, point]))
+
+    def orbit(self, lane: int, point: int, **options: Any) -> Orbit:
+        """The orbit at a point of a branch, to go on with: by `find_orbit`, whose `options` these are."""
+        if not 0 <= point < self.num[lane]:
+            raise IndexError(f"Lane {lane} has {self.num[lane]} points, but point {point} was asked for.")
+        system = self.system_at(lane, point)
+        period = dict(period=self.periods[lane, point]) if system.period is None else {}
+        y0 = jax.tree.map(lambda x: jnp.asarray(x[lane, point]), self.ys)
+        order, t0 = int(self.orders[lane]), self.ts[lane, point]
+        return find_orbit(system, y0, t0=t0, order=order, **period, **options)
 
     def __str__(self) -> str:
         words, counts = np.unique(self.ends, return_counts=True)
@@ -217,6 +235,7 @@ def _gathered(curve: OrbitCurve, parameter: str, lanes: _Lane, found: Lane) -> O
         periods=rows.period,
         ts=rows.t,
         ys=as_states(rows.x),
+        orders=lanes.order,
         low=as_states(rows.low),
         high=as_states(rows.high),
         multipliers=rows.multipliers,

@@ -91,17 +91,27 @@ def values_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Arr
     singular = sign * jnp.exp(jnp.clip(size - log, -300, 300))
     rho = look.multipliers
     counts = jnp.isfinite(rho) & ~(trivial(rho) & curve.autonomous)
-    flip = jnp.prod(jnp.where(counts, (1 + rho) / (1 + jnp.abs(rho)), 1)).real
+    flip = jnp.prod(jnp.where(counts, (1 + rho) / (1 + jnp.abs(rho)).astype(rho.dtype), 1)).real
     first, second = jnp.triu_indices(len(rho), 1)
     off = rho[first] * rho[second] - 1
-    pairs = jnp.prod(jnp.where(counts[first] & counts[second], off / (1 + jnp.abs(off)), 1)).real
+    pairs = jnp.prod(jnp.where(counts[first] & counts[second], off / (1 + jnp.abs(off)).astype(rho.dtype), 1)).real
     share = look.u[-1]
     head = jnp.stack([share, 1 - share, look.tangent[-1], singular, flip, pairs])
     return jnp.concatenate([head, rates, margins, lengths, guards.ravel()])
 
 
 def place_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Place:
-    row = Row(look.parameter, look.period, look.begin[0], look.x[0], look.low, look.high, look.multipliers, look.stable)
+    # In the middle of the longest segment, if possible of one that no surface holds.
+    mode, held = jnp.asarray(course.mode), jnp.zeros(len(look.begin), bool)
+    for k in curve.model.holdable:
+        held |= mode[:, k] == (1 if k in curve.model.contacts else 0)
+    length = jnp.where(jnp.arange(len(held), dtype=course.num.dtype) < course.num, look.end - look.begin, -jnp.inf)
+    i = jnp.argmax(length * jnp.where(held, 1e-6, 1.0))
+    middle = look.ts.shape[1] // 2
+    row = Row(
+        look.parameter, look.period, look.ts[i, middle], look.xs[i, middle], look.low, look.high, look.multipliers,
+        look.stable,
+    )  # fmt: skip
     return Place(look.u, look.tangent, look.branch[1], values_of(curve, look, course, log), row)
 
 
@@ -235,7 +245,7 @@ def _located(lane: Lane, here: Place, good: Array, s: Scalar, ends: Array, max_s
     ending = closed & ends[lane.target]
     end = jnp.where(ending, jnp.minimum(lane.end, s), lane.end)
     done = _written(done, here.row, lane.arc + s, lane.target, closed & good)
-    wanted = lane.wanted & ~(closed & (jnp.arange(len(ends)) == lane.target))
+    wanted = lane.wanted & ~(closed & (jnp.arange(len(ends), dtype=lane.target.dtype) == lane.target))
     over = closed & ~jnp.any(wanted)
     ended = over & jnp.isfinite(end)
     passes = over & ~ended

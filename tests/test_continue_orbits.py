@@ -71,7 +71,7 @@ def walls():
 def duffing():
     forces = jnp.array([0.2, 0.3, 0.4])
     orbits = sweep(lambda force: find_orbit(Duffing(force=force), Motion(0.3, 0.0), order=1, **HOW), forces)
-    return orbits, continue_orbits(orbits, "omega", (0.9, 2.2))
+    return orbits, continue_orbits(orbits, "omega", (0.9, 2.2), points=500)
 
 
 def test_grazing(walls):
@@ -136,7 +136,7 @@ def test_from_several_orbits(duffing):
     times = [branches.ts[lane, i] for i in places]
     assert np.allclose(times, times[0])
     each = [find_orbit(system, y, order=1, **HOW) for y in guesses]
-    again = continue_orbits(each, "omega", (0.9, 2.2))
+    again = continue_orbits(each, "omega", (0.9, 2.2), points=500)
     folds = sorted(branches.values[lane][branches.kinds[lane] == "fold"])
     for i in range(3):
         np.testing.assert_allclose(sorted(again.values[i][again.kinds[i] == "fold"]), folds, atol=1e-10)
