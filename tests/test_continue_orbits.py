@@ -124,18 +124,14 @@ def test_two_zeros_in_one_step(duffing):
 
 
 def test_from_several_orbits(duffing):
-    """At one parameter: the lower and the upper orbit lie on one branch."""
-    orbits, branches = duffing
+    """At nearly one parameter: the lower, the unstable and the upper orbit lie on one branch."""
+    _, branches = duffing
     lane, values = 1, branches.values[1, : branches.num[1]]
     omega = 1.6
     places = np.flatnonzero((values[:-1] - omega) * (values[1:] - omega) < 0)
     assert len(places) == 3
-    system = Duffing(force=0.3, omega=omega)
-    guesses = [jax.tree.map(lambda x: x[lane, i], branches.ys) for i in places]
-    # A state at another time than zero: the orbits begin at the time of the forcing.
-    times = [branches.ts[lane, i] for i in places]
-    assert np.allclose(times, times[0])
-    each = [find_orbit(system, y, order=1, **HOW) for y in guesses]
+    each = [branches.orbit(lane, i, **HOW) for i in places]
+    assert [bool(orbit.stable) for orbit in each] == [True, False, True]
     again = continue_orbits(each, "omega", (0.9, 2.2), points=500)
     folds = sorted(branches.values[lane][branches.kinds[lane] == "fold"])
     for i in range(3):
