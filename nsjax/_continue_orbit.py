@@ -16,7 +16,8 @@ from ._cycles import Cycle
 from ._orbit import Orbit
 from ._orbit_bifurcation import Origin
 from ._orbit_branch import orbit_branch, OrbitBranch, OrbitStrand, Point, TYPES as OF_BRANCHES
-from ._orbit_curve import Look, OrbitCurve
+from ._orbit_curve import OrbitCurve
+from ._orbit_look import Look
 from ._orbit_node import Half, itinerary, Node
 from ._orbit_record import Measures, Recorder
 from ._orbit_start import curve_and_start, options

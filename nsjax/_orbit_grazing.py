@@ -9,8 +9,9 @@ import numpy as np
 from scipy.optimize import toms748
 
 from ._course import Course, LEAST, Start, TIME
-from ._orbit_curve import OrbitCurve, with_parameter
+from ._orbit_curve import OrbitCurve
 from ._orbit_trace import OrbitTracer, Spot, Test, Zero
+from ._segment_flow import with_parameter
 
 
 def grazing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:

@@ -10,11 +10,12 @@ import numpy as np
 
 from ._course import same_course, Start, start_from
 from ._cycles import CornerMap, Cycle
-from ._orbit_curve import OrbitCurve, with_parameter
+from ._orbit_curve import OrbitCurve
 from ._orbit_grazing import grazing_at
 from ._orbit_node import admissible, Half, together, tracer_for, with_order
 from ._orbit_trace import Arc, OrbitTracer, PASSED, Spot, turned
 from ._return_map import Base, follow, frame
+from ._segment_flow import with_parameter
 
 
 DEPARTURES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-7)  # at which a half-branch is entered: of the parameter, in its interval

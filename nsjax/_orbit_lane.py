@@ -9,7 +9,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._course import Course, EVENT, FREE, LEAST
 from ._floquet import trivial
-from ._orbit_curve import Look, OrbitCurve, step_on
+from ._orbit_curve import OrbitCurve
+from ._orbit_look import Look, step_on
 from ._types import Scalar
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from ._course import capacity_for, Course, Start, TIME
 from ._cycles import Cycle
 from ._orbit_bifurcation import OrbitBifurcation, OrbitHalf
-from ._orbit_curve import advance, linearised, OrbitCurve, state_at
+from ._orbit_curve import linearised, OrbitCurve, state_at
+from ._orbit_look import advance
 from ._orbit_trace import alike, CORNERS, midpoint, OrbitTracer, Spot, spot_of, tests, turned, Zero
 
 

@@ -13,9 +13,11 @@ from jaxtyping import Array
 
 from ._course import capacity_for, Course, EVENT, LEAST, Start
 from ._orbit_bifurcation import Origin
-from ._orbit_curve import advance, linearised, Look, NODES, OrbitCurve, with_parameter
+from ._orbit_curve import linearised, OrbitCurve
+from ._orbit_look import advance, Look, zeros_at_begin
 from ._orbit_trace import branch_test, circle_tests, corner_tests, CORNERS, Spot, spot_of, Test
 from ._parameter import get_parameter
+from ._segment_flow import THETA, with_parameter
 
 
 DELTA = 1e-4  # of the differences that give the gradient of a test function, in units of the surface
@@ -211,8 +213,7 @@ def cleared(curve: OrbitCurve, spot: Spot) -> Spot:
     cuts = np.flatnonzero(course.ends[:n] == LEAST).tolist()
     if not cuts:
         return spot
-    theta = 0.5 - 0.5 * np.cos(np.pi * np.arange(NODES + 1) / NODES)
-    zeros = np.asarray(curve.zeros_at_begin(curve.model, course))
+    zeros = np.asarray(zeros_at_begin(curve, curve.model, course))
     least, where, spots = np.array(look.least), np.array(look.where), np.array(look.spots)
     for cut in cuts:
         slot = int(course.slot[cut])
@@ -220,12 +221,12 @@ def cleared(curve: OrbitCurve, spot: Spot) -> Spot:
             before = row - 1 if row else n - 1
             begins = 2 if (course.ends[before], course.slot[before]) == (LEAST, slot) else zeros[row, slot]
             ends = {LEAST: 2, EVENT: 1}.get(int(course.ends[row]), 0) if course.slot[row] == slot else 0
-            below = theta**begins * (1 - theta) ** ends
+            below = THETA**begins * (1 - THETA) ** ends
             values = np.asarray(_guards_along(curve, look, course, np.asarray(row)))[:, slot]
             # Samples nearer to the double zero are rounding divided by little.
             values = np.where(below > 1e-4, values / np.maximum(below, 1e-4), np.inf)
             at = int(np.argmin(values))
-            least[row, slot], where[row, slot], spots[row, slot] = values[at], theta[at], look.xs[row][at]
+            least[row, slot], where[row, slot], spots[row, slot] = values[at], THETA[at], look.xs[row][at]
     return dataclasses.replace(spot, look=look._replace(least=least, where=where, spots=spots))
 
 

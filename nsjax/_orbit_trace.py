@@ -9,7 +9,9 @@ import numpy as np
 from scipy.optimize import toms748
 
 from ._course import Course, EVENT, FREE, LEAST
-from ._orbit_curve import advance, least_between, Look, NODES, OrbitCurve, state_at, THETA
+from ._orbit_curve import OrbitCurve, state_at
+from ._orbit_look import advance, least_between, Look
+from ._segment_flow import NODES, THETA
 
 
 FIRST, SHORTEST = 1e-3, 1e-9  # steps, in units of the curve

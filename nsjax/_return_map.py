@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._cycles import CornerMap
-from ._orbit_curve import OrbitCurve, with_parameter
+from ._orbit_curve import OrbitCurve
 from ._orbit_trace import midpoint
 from ._parameter import put_parameter
+from ._segment_flow import with_parameter
 from ._solution import Events, is_okay
 from ._solve import solve
 

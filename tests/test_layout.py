@@ -73,6 +73,7 @@ ORDER = (
     "_course",
     "_segment_flow",
     "_orbit_curve",
+    "_orbit_look",
     "_orbit_start",
     "_orbit_lane",
     "_orbit_trace",
