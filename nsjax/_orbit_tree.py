@@ -238,7 +238,7 @@ class OrbitExplorer:
         if zero is None or zero.test.kind not in CORNERS:
             return None
         found = (grazing_at(tracer, zero) or zero) if zero.test.kind == "guard" else zero
-        return outwards(arc) if node.is_at(found.spot, half.curve) else None
+        return outwards(arc) if node.is_at(found, half.curve) else None
 
     def escaped(self, tree: OrbitTree) -> OrbitTree:
         """When all else is done: beyond a corner, in the course that ends there."""
