@@ -14,7 +14,7 @@ from ._course import Start, start_of
 from ._orbit import Orbit
 from ._orbit_curve import guard_sizes, OrbitCurve
 from ._parameter import get_parameter, parameter_path
-from ._segment_flow import exactness
+from ._segment_flow import exactness, fits, NEVER
 from ._solution import is_okay
 from ._system import arrays_of, System
 from ._types import Y
@@ -78,7 +78,19 @@ def curve_and_start(
     )
     normal, reference = phase_of(curve, start)
     curve = dataclasses.replace(curve, normal=normal, reference=reference)
-    return dataclasses.replace(curve, guard_sizes=guard_sizes(curve, start)), start
+    curve = dataclasses.replace(curve, guard_sizes=guard_sizes(curve, start))
+    return dataclasses.replace(curve, exact=_exact(curve, start, value)), start
+
+
+def _exact(curve: OrbitCurve, start: Start, value: float) -> int:
+    """Which flows are known by their exponentials, given the forcing along the orbit."""
+    if curve.exact == NEVER:
+        return NEVER
+    flow, course = curve.on(start.course).flow, start.course
+    states = [curve.state(jnp.asarray(course.mode[i]), jnp.asarray(course.part[i])) for i in course.rows]
+    rows = zip(start.begin, start.end, start.x, states)
+    known = all(bool(fits(flow, a, b, x, jnp.asarray(value), state)) for a, b, x, state in rows)
+    return curve.exact if known else NEVER
 
 
 def sizes_of(orbit: Orbit, scale: Y | None) -> np.ndarray:

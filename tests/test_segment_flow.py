@@ -1,0 +1,112 @@
+"""The flow of one mode: by the matrix exponential and by steps, with its derivatives."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import Motion, pid
+
+import nsjax
+from nsjax import continue_orbit, find_orbit, gallery
+from nsjax._arcs import model_of
+from nsjax._orbit_curve import OrbitCurve
+from nsjax._orbit_start import options
+from nsjax._segment_flow import ALWAYS, exactness, FREE_MODES, NEVER, SegmentFlow
+from nsjax._system import arrays_of
+
+
+Y = Motion(jnp.asarray(0.3), jnp.asarray(-0.4))
+HOW = options(dfx.Dopri8(), None, 4096)
+
+
+class Driven(nsjax.System):
+    """Forced at two frequencies: no exponential of a small matrix knows that."""
+
+    omega: float = 0.7
+    both: float = 1.0
+
+    def vector_field(self, t, y, s):
+        force = jnp.cos(self.omega * t) + self.both * jnp.cos(2 * self.omega * t)
+        return Motion(y.v, force - 0.2 * y.v - y.x)
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+def flow_of(system, exact, name="omega", slides=True):
+    system = arrays_of(system, jnp.float64)
+    model = model_of(system, jnp.zeros(()), Y)
+    return SegmentFlow(model, (name,), Y, HOW, exact, slides)
+
+
+def test_which_modes():
+    def kind(system):
+        system = arrays_of(system, jnp.float64)
+        return exactness(model_of(system, jnp.zeros(()), Y), jnp.zeros(()), Y)
+
+    assert kind(gallery.ForcedFriction(omega=0.8)) == ALWAYS
+    assert kind(gallery.Trilinear(omega=1.2)) == FREE_MODES
+    assert kind(gallery.ForcedStickSlip(omega=1.65)) == NEVER
+
+
+@pytest.mark.parametrize("mode", [-1, 0, 1])
+@pytest.mark.parametrize("ends", [(0.3, 2.9), (0.3, 0.3), (0.3, -1.1)])
+def test_both_ways(mode, ends):
+    """Also of no length, and backwards."""
+    state = OrbitCurve.state
+    system = gallery.ForcedFriction(omega=0.8)
+    results = []
+    for exact in (True, False):
+        flow = flow_of(system, exact)
+        curve = _Curve(flow.model)
+        a, b = (jnp.asarray(t) for t in ends)
+        x, value = jnp.array([0.3, 0.0 if mode == 0 else -0.4 * mode]), jnp.asarray(0.83)
+        where = state(curve, jnp.asarray([mode], jnp.int32), jnp.asarray([0], jnp.int32))
+
+        def end(a, b, x, value, flow=flow, where=where):
+            return flow.arrive(a, b, x, value, where)
+
+        jacobians = jax.jacfwd(end, argnums=(0, 1, 2, 3))(a, b, x, value)
+        results.append((end(a, b, x, value), jacobians, flow.along(a, b, x, value, where)))
+    (exact, by, (ts, xs, sums)), (stepped, want, (ts_2, xs_2, sums_2)) = results
+    np.testing.assert_allclose(exact, stepped, atol=1e-11)
+    for found, other in zip(by, want):
+        np.testing.assert_allclose(found, other, atol=1e-10)
+    np.testing.assert_allclose(ts, ts_2, atol=1e-15)
+    np.testing.assert_allclose(xs, xs_2, atol=1e-7)  # the solver's dense output
+    if ends[1] >= ends[0]:
+        np.testing.assert_allclose(sums, sums_2, atol=1e-10)
+
+
+class _Curve:
+    """As much of a curve as tells states."""
+
+    def __init__(self, model):
+        self.model = model
+
+
+def test_samples():
+    """Between the ends too they are those of the exponential: each is the end of a shorter flow."""
+    flow = flow_of(gallery.Trilinear(omega=1.2), True, slides=False)
+    where = OrbitCurve.state(_Curve(flow.model), jnp.asarray([-1, 1], jnp.int32), jnp.asarray([0, 0], jnp.int32))
+    a, x, value = jnp.asarray(0.1), jnp.array([-1.1, 0.2]), jnp.asarray(1.2)
+    ts, xs, _ = flow.along(a, jnp.asarray(1.3), x, value, where)
+    for i in (0, 1, 7, 31, 64):
+        np.testing.assert_allclose(flow.arrive(a, ts[i], x, value, where), xs[i], atol=1e-12)
+
+
+def test_two_frequencies():
+    """What the exponential does not know goes by steps."""
+    points = []
+    for both in (1.0, 0.0):
+        system = Driven(both=both)
+        how = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-12), method="shooting")
+        branch = continue_orbit(system, find_orbit(system, Motion(1.0, 0.0), order=1, **how), "omega", (0.69, 0.71))
+        k = np.array([1, 2])[:, None]
+        gains = np.array([1.0, both])[:, None] / (1 - (k * branch.values) ** 2 + 0.2j * k * branch.values)
+        want = np.sum(gains * np.exp(1j * k * branch.values * branch.ts), axis=0).real
+        np.testing.assert_allclose(branch.ys.x, want, atol=1e-10)
+        points.append(len(branch))
+    assert min(points) > 2
