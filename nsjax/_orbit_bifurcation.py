@@ -99,7 +99,9 @@ class OrbitBifurcation(NamedTuple):
     def name(self) -> str:
         """As the thesis says it: "discontinuous fold bifurcation"."""
         if self.kind == "none":
-            return "no bifurcation: " + ("sliding-mode transition" if self.transition else "the multipliers jump")
+            jump = not np.allclose(*self.multipliers, rtol=1e-5, atol=1e-6)
+            plain = "the multipliers jump" if jump else "the itinerary changes"
+            return "no bifurcation: " + ("sliding-mode transition" if self.transition else plain)
         if self.kind == "end":
             return "end of the branch"
         words = ["discontinuous"] * self.discontinuous + [self.kind, "bifurcation"]

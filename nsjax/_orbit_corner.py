@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ._course import capacity_for, EVENT, FREE, Start
+from ._course import capacity_for, EVENT, FREE, LEAST, Start
 from ._crossings import eigenvalue_crossings
 from ._cycles import corner_kind, CornerMap, Cycle, Cycles, find_cycles
 from ._orbit_bifurcation import named, OrbitBifurcation, Origin
@@ -100,7 +100,9 @@ def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple
     u = np.asarray(once.curve.pack(Start(short, np.array(begins), np.array(ends), x), zero.spot.parameter))
     border = np.zeros_like(u)
     border[-1] = 1.0
-    if zero.test.kind == "duration":  # it stays zero: the parameter may be least there
+    if (
+        zero.test.kind == "duration" and short.ends[len(lap_rows) - 1] != LEAST
+    ):  # it stays zero: the parameter may be least there
         at = (len(lap_rows) - 1) * (len(curve.sizes) + 2)
         border[[-1, at, at + 1]] = 0.0, -1.0, 1.0
     spot = once.corrected(short, u, border)

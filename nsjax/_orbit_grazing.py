@@ -8,10 +8,64 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import toms748
 
-from ._course import Course, LEAST, Start, TIME
+from ._course import capacity_for, Course, EVENT, LEAST, Start, TIME
 from ._orbit_curve import OrbitCurve
-from ._orbit_trace import OrbitTracer, Spot, Test, Zero
+from ._orbit_trace import alike, OrbitTracer, Spot, Test, Zero
 from ._segment_flow import with_parameter
+from ._system import impact
+
+
+TANGENTIAL = 0.1  # the rate of a guard, in units of the curve, below which a segment that vanishes may be a grazing
+FOUND = 3e-3  # how far from a point where the equations are singular the orbit that grazes is
+
+
+def exactly(tracer: OrbitTracer, zero: Zero) -> Zero | None:
+    """A corner by equations that are smooth and regular there; None if its grazing is not found."""
+    if zero.test.kind == "guard":
+        return grazing_at(tracer, zero)
+    return (touching_at(tracer, zero) or zero) if zero.test.kind in ("duration", "rate") else zero
+
+
+def touching_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
+    """Where segments beyond a surface vanish because orbits only graze it: both ends come to it tangentially, and the
+    equations are singular. Those without these segments, but with cuts, are not. None if it is nothing like that."""
+    curve, look, c, n = tracer.curve, zero.spot.look, zero.spot.course, int(zero.spot.course.num)
+    slots, length = curve.model.slots, np.asarray(look.end) - np.asarray(look.begin)
+    size = np.asarray(curve.guard_sizes)[np.asarray(c.slot)] / float(curve.time) if slots else 1.0
+    slow = np.abs(look.rates) < TANGENTIAL * size
+
+    def vanishes(i: int) -> bool:
+        h, j = (i - 1) % n, (i + 1) % n
+        before, after = slots[int(c.slot[h])], slots[int(c.slot[i])]
+        plain = not before.holding and not isinstance(curve.model.switches[before.switch], impact)
+        crossed = c.ends[h] == c.ends[i] == EVENT and before.switch == after.switch
+        return bool(plain and crossed and slow[h] and slow[i] and np.all(c.mode[h] == c.mode[j]))
+
+    gone = set()
+    for kind, i, _ in (zero.test, *zero.others):
+        if kind in ("margin", "rate", "duration") and n > 1:
+            around = [i] if kind != "rate" else [i, (i + 1) % n]
+            short = [j for j in around if length[j] < TANGENTIAL * float(curve.time) and vanishes(j)]
+            if not short:
+                return None
+            gone.add(min(short, key=lambda j: length[j]))
+    before = [(i - 1) % n for i in sorted(gone)]
+    if not gone or gone & set(before):
+        return None
+    kept = [i for i in range(n) if i not in gone]
+    targets = [kept.index(i) for i in before]
+    course = c.take(kept, capacity_for(len(kept)))
+    ends = np.array(course.ends)
+    ends[targets] = LEAST
+    start = Start(course._replace(ends=ends), look.begin[kept], look.end[kept], look.x[kept])
+    at = tracer.corrected(start.course, np.asarray(curve.pack(start, zero.spot.parameter)))
+    found = None if at is None else _zero_along(tracer, at, targets[0])
+    if found is None or abs(found.parameter - zero.spot.parameter) > FOUND * float(curve.width):
+        return None
+    if not alike(found, zero.spot, curve, FOUND) or np.any(np.abs(found.look.ends[targets]) > 1e-9):
+        return None
+    first, *others = (Test("duration", row) for row in targets)
+    return zero._replace(spot=found, test=first, others=tuple(others))
 
 
 def grazing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:

@@ -11,7 +11,7 @@ import numpy as np
 from ._course import same_course, Start, start_from
 from ._cycles import CornerMap, Cycle
 from ._orbit_curve import OrbitCurve
-from ._orbit_grazing import grazing_at
+from ._orbit_grazing import exactly
 from ._orbit_node import admissible, Half, together, tracer_for, with_order
 from ._orbit_trace import Arc, OrbitTracer, PASSED, Spot, turned
 from ._return_map import Base, follow, frame
@@ -70,9 +70,7 @@ def _beside(tracer: OrbitTracer, at: Spot, found: Spot) -> Spot | None:
             arc = short.further(arc)
             if arc.at is not None and arc.at.test.kind in PASSED:
                 passed.append(len(arc.spots) - 1)
-        end = arc.end
-        if end is not None and end.test.kind == "guard":
-            end = grazing_at(tracer, end)
+        end = None if arc.end is None else exactly(tracer, arc.end)
         if end is None or not together(end.spot, at, tracer.curve, NEIGHBOUR):
             continue
         if not passed:

@@ -11,7 +11,7 @@ from ._orbit_bifurcation import OrbitBifurcation
 from ._orbit_branch import OrbitStrand, Point
 from ._orbit_corner import node_at
 from ._orbit_curve import OrbitCurve
-from ._orbit_grazing import grazing_at
+from ._orbit_grazing import exactly
 from ._orbit_node import admissible, Half, Node, tracer_for
 from ._orbit_record import Recorder
 from ._orbit_trace import alike, Arc, CORNERS, OrbitTracer, PASSED, SAME, Spot, turned
@@ -159,8 +159,7 @@ class OrbitExplorer:
             return self.ended(tree, CLOSED if arc.closed else arc.why)
         if zero.test.kind in ("low", "high"):
             return self.ended(tree, f"{self.name} = {zero.spot.parameter:.6g}")
-        if zero.test.kind == "guard":
-            zero = grazing_at(tracer, zero) or zero
+        zero = exactly(tracer, zero) or zero
         at = next((i for i, node in enumerate(tree.nodes) if node.is_at(zero, walk.curve)), len(tree.nodes))
         if at == len(tree.nodes):
             node = node_at(tracer, self.name, zero, max(1, self.max_order // order))
@@ -237,7 +236,7 @@ class OrbitExplorer:
         zero = arc.end
         if zero is None or zero.test.kind not in CORNERS:
             return None
-        found = (grazing_at(tracer, zero) or zero) if zero.test.kind == "guard" else zero
+        found = exactly(tracer, zero) or zero
         return outwards(arc) if node.is_at(found, half.curve) else None
 
     def escaped(self, tree: OrbitTree) -> OrbitTree:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import reference
 from models import Motion
+from scipy.optimize import fsolve
 from test_continue_orbit import orbit_of, same_multipliers, stability_agrees, the
 
 import nsjax
@@ -181,6 +182,74 @@ class Filtered(nsjax.System):
     @property
     def period(self):
         return 2 * jnp.pi / self.omega
+
+
+class Bilinear(nsjax.System):
+    """x'' + c x' + x + k max(x, 0) = cos ωt: the field is continuous, and where an orbit grazes the surface nothing
+    happens."""
+
+    c: float = 0.1
+    k: float = 4.0
+    omega: float = 2.2
+
+    def vector_field(self, t, y, s):
+        spring = self.k * y.x * (1 + s.contact) / 2
+        return Motion(y.v, jnp.cos(self.omega * t) - self.c * y.v - y.x - spring)
+
+    @nsjax.sgn
+    def contact(self, t, y):
+        return y.x
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+def bilinear_reference(guess, off):
+    """Of an orbit with one contact: begin, duration, velocity, ..., and the frequency at which all of `off` vanishes."""
+    return fsolve(lambda u: [float(x) for x in off(BumperReference(u[-1]), *u[:-1])], guess, xtol=1e-12)[-1]
+
+
+def returns(known, begin, contact, v, laps=1):
+    at = known.flow(begin, mp.matrix([0, v]), begin + contact, True, 0)
+    back = known.flow(begin + contact, at, begin + laps * known.period, False, 0)
+    return [at[0], back[0], back[1] - v]
+
+
+def flips(known, begin, contact, v):
+    m = known.monodromy(contact)
+    det = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
+    return [*returns(known, begin, contact, v), 1 + m[0, 0] + m[1, 1] + det]
+
+
+def grazes(known, begin, contact, v, touch):
+    return [*returns(known, begin, contact, v, 2), *known.flow(begin, mp.matrix([0, v]), touch, True, 0)]
+
+
+def test_grazing_of_a_continuous_field():
+    """A bilinear oscillator: whether a branch comes to a grazing from the side with or without the contact, it goes on,
+    though the equations with a contact of no duration are singular."""
+    flip = bilinear_reference((0.8956, 0.9211, 0.6358, 2.2647), flips)
+    corner = bilinear_reference((1.2503, 2.6861, 0.604, 2.5108, 2.4248), grazes)
+    branch = continue_orbit(
+        Bilinear(), orbit_of(Bilinear(), Motion(-0.7, 0.1)), "omega", (2.2, 2.6), solver=dfx.Tsit5()
+    )
+    assert the(branch, flip, 1e-10).count == ((1,), (1, 2))
+    point = the(branch, corner, 1e-10)
+    assert (point.kind, point.count, point.name) == ("none", ((1,), (1,)), "no bifurcation: the itinerary changes")
+    assert len(branch.special_points) == 2 and len(branch.others) == 1
+    assert branch.others[0].values.max() == pytest.approx(2.6) and branch.others[0].stable[2:].all()
+
+
+def test_isola_of_a_continuous_field():
+    """Its orbits of period 3 at these frequencies are a closed curve, passed through two grazings from one side each."""
+    orbit = orbit_of(Bilinear(omega=2.0), Motion(-1.2, 0.4), order=3)
+    branch = continue_orbit(orbit.system, orbit, "omega", (1.5, 3.3), solver=dfx.Tsit5())
+    assert sorted(b.kind for b in branch.special_points) == ["fold", "fold", "none", "none"]
+    assert not branch.others and branch.ends[1] == "the start: it is closed"
+    decay = np.exp(-0.1 * branch.periods)
+    assert np.prod(branch.multipliers, axis=1).real == pytest.approx(decay, rel=1e-6)
+    assert stability_agrees(branch, 6, seed=1) > 3
 
 
 @pytest.mark.slow
