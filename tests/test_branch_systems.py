@@ -252,6 +252,47 @@ def test_isola_of_a_continuous_field():
     assert stability_agrees(branch, 6, seed=1) > 3
 
 
+class Ball(nsjax.System):
+    """A ball that bounces on a table of acceleration -a g cos ωt, once a period."""
+
+    a: float = 0.8
+    r: float = 0.7
+    g: float = 1.0
+    omega: float = 2 * np.pi
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -self.g + s.table)
+
+    @nsjax.impact
+    def table(self, t, y):
+        return y.x - self.a * self.g / self.omega**2 * jnp.cos(self.omega * t)
+
+    @table.restitution
+    def table(self):
+        return self.r
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+@pytest.mark.slow
+def test_bouncing_ball():
+    """Fold and flip are known in closed form: the table's velocity at the impact is (1 - r) / (1 + r) of the ball's after
+    it, g T / 2; its acceleration there is 0 at the fold, and -2 g (1 + r²) / (1 + r)² at the flip."""
+    r, T = 0.7, 1.0
+    fold = np.pi * (1 - r) / (1 + r)
+    flip = np.hypot(fold, 2 * (1 + r**2) / (1 + r) ** 2)
+    phase = -np.arcsin(fold / 0.8) / (2 * np.pi)
+    flight = -phase
+    x = 0.8 / (2 * np.pi) ** 2 * np.cos(2 * np.pi * phase) + T / 2 * flight - flight**2 / 2
+    branch = continue_orbit(Ball(), orbit_of(Ball(), Motion(x, T / 2 - flight)), "a", (0.4, 1.3), solver=dfx.Tsit5())
+    assert (the(branch, fold, 1e-10).kind, the(branch, flip, 1e-10).kind) == ("fold", "flip")
+    assert len(branch.special_points) == 2 and len(branch.others) == 1
+    once = [n == 1 for n in branch.orders]
+    assert np.prod(branch.multipliers, axis=1)[once].real == pytest.approx(r**2)
+
+
 @pytest.mark.slow
 def test_three_states():
     """A third state, in a dictionary, and another solver."""
