@@ -80,6 +80,17 @@ def test_both_ways(mode, ends):
         np.testing.assert_allclose(sums, sums_2, atol=1e-10)
 
 
+@pytest.mark.parametrize("a", np.linspace(0.0, 7.0, 8))
+def test_forcing_that_cancels(a):
+    """While friction holds, forcing leaves nothing but rounding behind."""
+    flow = flow_of(gallery.ForcedFriction(omega=0.8, f_0=250.0), True)
+    where = OrbitCurve.state(_Curve(flow.model), jnp.asarray([0], jnp.int32), jnp.asarray([0], jnp.int32))
+    x = jnp.array([0.02, 0.0])
+    np.testing.assert_allclose(
+        flow.arrive(jnp.asarray(a), jnp.asarray(a + 0.7), x, jnp.asarray(0.8), where), x, atol=1e-14
+    )
+
+
 class _Curve:
     """As much of a curve as tells states."""
 
