@@ -128,8 +128,7 @@ def continue_orbits(
 
     **Returns:** `OrbitBranches`. Lanes without an orbit to start from, or outside the interval, have no points.
 
-    **Raises:** `ValueError` for an unknown parameter, in single precision, if no lane has an orbit to start from, or if
-    the orders of subharmonics differ from lane to lane.
+    **Raises:** `ValueError` for an unknown parameter, in single precision, or if no lane has an orbit to start from.
     """
     how = options(solver, stepsize_controller, max_steps)
     each = list(orbits) if isinstance(orbits, Sequence) else _unstacked(orbits)
@@ -143,6 +142,8 @@ def continue_orbits(
     first = good.index(True)
     curve, _ = curve_and_start(each[first].system, each[first], parameter, interval, scale, how)
     starts = {i: start_of(one.system, one) for i, one in enumerate(each) if good[i]}
+    # One program for all: with the flows of modes that surfaces hold, if there are any.
+    curve = dataclasses.replace(curve, slides=any(curve.on(start.course).slides for start in starts.values()))
     capacity = capacity_for(max(int(start.course.num) for start in starts.values()))
     rows = [_lane_of(curve, each[i], starts[i], capacity) for i in (j if good[j] else first for j in range(len(each)))]
     lanes = jax.tree.map(lambda *xs: np.stack(xs), *rows)
