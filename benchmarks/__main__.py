@@ -14,6 +14,7 @@ RUNS = (
     ("cost.py", "--out", "cost.json"),
     ("growth.py", "--out", "growth"),
     ("orbits.py", "--out", "orbits.json"),
+    ("branches.py", "--out", "branches.json"),
     ("work_precision.py", "--out", "work_precision"),
 )
 

@@ -1,12 +1,15 @@
 """How the tests run: double precision, strict promotion of dtypes, compiled programs kept between runs."""
 
+import ctypes
 import gc
 import os
 import pathlib
+import sys
 
 import jax
 import jaxlib
 import matplotlib
+import pytest
 
 
 # The tests compile much and compute little: XLA's older code generator compiles twice as fast, for slower programs.
@@ -21,3 +24,13 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 matplotlib.use("Agg")
 gc.set_threshold(100_000, 20, 20)  # tracing makes many objects, and looking through them takes a fifth of its time
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forgotten():
+    """Programs of one file are of no use to the next, and all of them together take some ten gigabytes."""
+    yield
+    jax.clear_caches()
+    gc.collect()
+    if sys.platform == "linux":  # which keeps what was freed, until it is told not to
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
