@@ -15,9 +15,10 @@ from ._orbit_curve import OrbitCurve
 from ._orbit_locus import FAILED, LAST, Met, trace, Trail
 from ._orbit_singular import BranchLocus
 from ._orbit_surface import CUSP, lifted, Locus, RESONANCES, surfaces_of, touches
-from ._orbit_trace import CORNERS, midpoint, Spot, Test
+from ._orbit_trace import midpoint, Spot
 from ._parameter import get_parameter, parameter_path
 from ._system import System
+from ._test_function import CORNERS, Test
 from ._types import Y
 
 

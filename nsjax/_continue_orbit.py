@@ -7,7 +7,6 @@ import warnings
 
 import diffrax as dfx
 import jax.numpy as jnp
-import numpy as np
 
 from ._archive import Archive, plain, save, table
 from ._arcs import model_of
@@ -161,7 +160,7 @@ class OrbitGrowth:
         curve, start = curve_and_start(system, orbit, parameter, interval, scale, how)
         start, value = start.filled(), get_parameter(curve.model.system, curve.path)
         tracer = OrbitTracer(curve, max_step, max_points)
-        spot = tracer.corrected(start.course, np.asarray(curve.pack(start, value)))
+        spot = tracer.corrected(start.course, curve.pack(start, value))
         if spot is None:
             raise ValueError("Argument `orbit` must be an orbit of `system`, but none was found next to it.")
         self._explorer = OrbitExplorer(

@@ -12,16 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from ._course import capacity_for, Course, Start, start_of
+from ._course import capacity_for, Course, Start, starts_of
 from ._find_orbit import find_orbit
 from ._orbit import Orbit
 from ._orbit_curve import OrbitCurve
-from ._orbit_lane import ENDED, follow_lane, Lane, LOST, names, NO_ORBIT, PASSED
-from ._orbit_start import check_precision, curve_and_start, options, phase_of
+from ._orbit_lane import EACH, ENDED, follow_lane, Lane, lane_tests, LOST, NO_ORBIT
+from ._orbit_start import check_precision, curve_and_start, options, order_of, phase_of
 from ._parameter import get_parameter, parameter_path, put_parameter
 from ._solution import is_okay
 from ._sweep import sweep
 from ._system import arrays_of, System
+from ._test_function import BRANCH, PASSED, Test
 from ._types import Y
 
 
@@ -42,8 +43,8 @@ class OrbitBranches(eqx.Module):
     - `start`: at which point each lane set out.
     - `num`: how many points each lane has.
     - `ends`: why each branch begins and ends where it does, shape `(lanes, 2)`, as text: the end of the interval; a
-        corner, which `continue_orbit` tells more about; "more than so many points"; "lost", where Newton's method
-        failed; or "no orbit", where there was none to start from.
+        corner, which `continue_orbit` tells more about; "more than so many points" (or orbits computed, where steps
+        have to be short); "lost", where Newton's method failed; or "no orbit", where there was none to start from.
     """
 
     systems: System
@@ -141,7 +142,8 @@ def continue_orbits(
         raise ValueError("Argument `orbits` must hold an orbit that was found, within `interval`, but none is.")
     first = good.index(True)
     curve, _ = curve_and_start(each[first].system, each[first], parameter, interval, scale, how)
-    starts = {i: start_of(one.system, one) for i, one in enumerate(each) if good[i]}
+    own = [i for i, one in enumerate(good) if one]
+    starts = dict(zip(own, starts_of(curve.model, [each[i] for i in own])))
     # One program for all: with the flows of modes that surfaces hold, if there are any.
     curve = dataclasses.replace(curve, slides=any(curve.on(start.course).slides for start in starts.values()))
     capacity = capacity_for(max(int(start.course.num) for start in starts.values()))
@@ -172,13 +174,12 @@ class _Lane(NamedTuple):
 
 def _lane_of(curve: OrbitCurve, orbit: Orbit, start: Start, capacity: int) -> _Lane:
     system = arrays_of(orbit.system, jnp.float64)
-    order = 1 if system.period is None else int(round(float(orbit.period) / float(system.period)))
     own = dataclasses.replace(curve, model=eqx.tree_at(lambda m: m.system, curve.model, system))
     normal, reference = phase_of(own, start)
     start = start._replace(course=start.course.take(list(start.course.rows), capacity))
-    u = np.asarray(curve.pack(start, get_parameter(system, curve.path)))
-    system = jax.tree.map(np.asarray, system)
-    return _Lane(system, np.asarray(order, np.int32), normal, reference, start.course, u)
+    u = curve.pack(start, get_parameter(system, curve.path))
+    order, system = order_of(system, orbit), jax.tree.map(np.asarray, system)
+    return _Lane(system, order, normal, reference, start.course, u)
 
 
 class _Follow(eqx.Module):
@@ -258,8 +259,8 @@ def _way(curve: OrbitCurve, courses: Course, found: Lane, i: int) -> tuple[list[
     if doing == ENDED:
         order = [j for j in order if arcs[j] <= found.arc[i] + found.end[i]]
     course = jax.tree.map(lambda x: x[i % len(courses.num)], courses)
-    tests = names(len(course.slot), len(curve.model.slots))
-    words = [_word(curve, course, *tests[k]) if k >= 0 else "" for k in kinds[order]]
+    tests = lane_tests(len(course.slot), len(curve.model.slots))
+    words = [_word(curve, course, tests[k]) if k >= 0 else "" for k in kinds[order]]
     for j, word in enumerate(words):
         rho = found.rows.multipliers[i, order[j]]
         # A product of multipliers is 1, as at a Neimark-Sacker point, but they are real.
@@ -267,14 +268,20 @@ def _way(curve: OrbitCurve, courses: Course, found: Lane, i: int) -> tuple[list[
             words[j] = ""
         if word == "fold" and "branch point" in words[max(0, j - 1) : j + 2]:
             words[j] = ""
-    told = {ENDED: words[-1], LOST: "lost"}.get(doing, f"more than {len(found.arcs[i])} points")
-    return order, words, told
+    if doing == ENDED:
+        return order, words, _word(curve, course, tests[found.last[i]])
+    points = len(found.arcs[i])
+    enough = f"more than {points} points" if len(arcs) == points else f"more than {EACH * points} orbits computed"
+    return order, words, "lost" if doing == LOST else enough
 
 
-def _word(curve: OrbitCurve, course: Course, kind: str, row: int, slot: int) -> str:
-    if kind in ("low", "high"):
+def _word(curve: OrbitCurve, course: Course, test: Test) -> str:
+    if test.kind in ("low", "high"):
         return "end of the interval"
-    if kind in PASSED:
-        return kind
-    slot = slot if kind == "grazing" else int(course.slot[row])
+    if test == BRANCH:
+        return "branch point"
+    if test.kind in PASSED:
+        return test.kind
+    slot = test.slot if test.kind == "guard" else int(course.slot[test.row])
+    kind = {"rate": "tangency", "guard": "grazing"}.get(test.kind, test.kind)
     return f"{kind} of {curve.model.switches[curve.model.slots[slot].switch].name}"

@@ -1,18 +1,22 @@
 """What an orbit passes through: its segments, each in a mode, and what ends them."""
 
+import math
+from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Array, Float, Int
 
-from ._arcs import model_of
 from ._filippov import Model
 from ._orbit import Orbit
 from ._saltation import states
-from ._system import relay, sgn, System
-from ._types import Y
+from ._solution import Events
+from ._system import arrays_of, relay, sgn, System
+from ._types import Scalar, Y
 
 
 # What ends a segment: a guard falls to zero; a period has passed (of an orbit without events); a guard is least there
@@ -90,61 +94,100 @@ def event_slot(model: Model, k: int, mode: Any, part: int, multiplier: float) ->
     return slot_of(model, k, False, 0 if isinstance(model.switches[k], relay) else part), 0
 
 
-def start_of(system: System, orbit: Orbit) -> Start:
-    """The course of an orbit, from its events: the segments between them."""
-    log = orbit.events
-    rows = [
-        (float(e.t), e.switch, tuple(e.mode_before.values()), tuple(e.mode_after.values()), e.y_before, e.y_after)
-        for e in log
+class Diary(NamedTuple):
+    """What happens to an orbit in one period: its events, with modes and states before and after each."""
+
+    t: Float[np.ndarray, " events"]
+    switch: Int[np.ndarray, " events"]
+    modes: tuple[Int[np.ndarray, "events switches"], Int[np.ndarray, "events switches"]]
+    states: tuple[Float[np.ndarray, "events n"], Float[np.ndarray, "events n"]]
+
+    @classmethod
+    def of(cls, log: Events) -> "Diary":
+        n = int(log.num)
+        modes, states = (log.mode_before, log.mode_after), (log.y_before, log.y_after)
+        t, switch, modes, states = jax.tree.map(lambda x: np.asarray(x)[:n], (log.t, log.switch, modes, states))
+
+        def flat(y: Y) -> np.ndarray:
+            return np.concatenate([x.reshape(n, math.prod(x.shape[1:])) for x in jax.tree.leaves(y)], axis=1)
+
+        return cls(t, switch, modes, (flat(states[0]), flat(states[1])))
+
+    def joined(self, other: "Diary") -> "Diary":
+        return jax.tree.map(lambda *rows: np.concatenate(rows), self, other)
+
+
+@eqx.filter_jit
+def _looked_at(model: Model, like: Y, systems: System, diaries: Diary) -> tuple[Array, Array, Array]:
+    """At each event of each orbit the component of every h that is nearest to zero, before it and after; and the
+    multiplier of the switch that has it."""
+    unravel = jfu.ravel_pytree(like)[1]
+
+    def nearest(model: Model, t: Scalar, y: Y) -> Array:
+        each = [() if isinstance(s, relay) else model.h(k, t, y) for k, s in enumerate(model.switches)]
+        return jnp.stack([jnp.argmin(jnp.abs(jnp.stack(h))) if len(h) > 1 else jnp.zeros((), int) for h in each])
+
+    def event(system: System, t: Scalar, switch: Array, modes: Any, rows: Any) -> tuple[Array, Array, Array]:
+        here = eqx.tree_at(lambda m: m.system, model, system)
+        before, after = map(unravel, rows)
+        values = here.values(t, before, states(here, t, before, tuple(modes[0])))
+        holdable = jnp.asarray([k in here.holdable for k in range(len(here.switches))])
+        multiplier = jnp.where(holdable, jnp.stack(values), 0)[switch]
+        return nearest(here, t, before), nearest(here, t, after), multiplier
+
+    return jax.vmap(lambda system, diary: jax.vmap(partial(event, system))(*diary))(systems, diaries)
+
+
+def starts_of(model: Model, orbits: list[Orbit]) -> list[Start]:
+    """The courses of orbits of one model that differ in its parameters, from their events."""
+    diaries = [Diary.of(orbit.events) for orbit in orbits]
+    systems = [arrays_of(orbit.system, jnp.float64) for orbit in orbits]
+    at = [(float(orbit.t0), float(orbit.period), np.asarray(orbit.mode, np.int32)) for orbit in orbits]
+    x0 = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(orbit.y0)]) for orbit in orbits]
+    return starts_from(model, orbits[0].y0, systems, diaries, [(*one, x) for one, x in zip(at, x0)])
+
+
+def starts_from(model: Model, like: Y, systems: list[System], diaries: list[Diary], at: list[tuple]) -> list[Start]:
+    """The same from what happens in a period that begins `at` (time, period, mode, state)."""
+    capacity = capacity_for(max(len(diary.t) for diary in diaries))
+    eventful = [i for i, diary in enumerate(diaries) if len(diary.t)]
+    seen = {}
+    if eventful:
+
+        def filled(x: np.ndarray) -> np.ndarray:
+            return np.concatenate([x, np.repeat(x[-1:], capacity - len(x), axis=0)])
+
+        rows = jax.tree.map(lambda *xs: np.stack([filled(x) for x in xs]), *[diaries[i] for i in eventful])
+        stacked = jax.tree.map(lambda *xs: np.stack(xs), *[systems[i] for i in eventful])
+        found = jax.device_get(_looked_at(model, like, stacked, rows))
+        seen = {i: jax.tree.map(lambda x: x[j], found) for j, i in enumerate(eventful)}
+    return [
+        _start(model, diary, seen[i], period) if i in seen else _uneventful(*at[i])
+        for i, (diary, (_, period, _, _)) in enumerate(zip(diaries, at))
     ]
-    flat = np.asarray(jfu.ravel_pytree(orbit.y0)[0])
-    return start_from(system, orbit.y0, rows, float(orbit.t0), float(orbit.period), flat, np.asarray(orbit.mode))
 
 
-def start_from(
-    system: System, like: Y, events: list[tuple], t0: float, period: float, x0: np.ndarray, mode: np.ndarray
-) -> Start:
-    """The same from rows (time, switch, mode before, mode after, state before, state after) of a whole period."""
-    model = model_of(system, jnp.asarray(t0), like)
-    names = [k.name for k in model.switches]
-    if not events:
-        none = np.zeros((1, len(names)), np.int32)
-        one = np.zeros(1, np.int32)
-        course = Course(np.asarray(mode, np.int32)[None], none, one + TIME, one, one, np.asarray(1, np.int32))
-        return Start(course, np.array([t0]), np.array([t0 + period]), x0[None])
+def _uneventful(t0: float, period: float, mode: np.ndarray, x0: np.ndarray) -> Start:
+    none, one = np.zeros((1, len(mode)), np.int32), np.zeros(1, np.int32)
+    course = Course(mode[None], none, one + TIME, one, one, np.asarray(1, np.int32))
+    return Start(course, np.array([t0]), np.array([t0 + period]), x0[None])
 
-    def part_at(t: float, y: Y) -> list[int]:
-        """The component of h nearest to zero, of each surface."""
-        return [
-            0 if isinstance(s, relay) else int(np.argmin(np.abs([float(h) for h in model.h(k, jnp.asarray(t), y)])))
-            for k, s in enumerate(model.switches)
-        ]
 
-    modes, parts, slots, entries, begin, end, x = [], [], [], [], [], [], []
-    for i, (t, _, _, after, _, y) in enumerate(events):
-        last = i + 1 == len(events)
-        t_next, name, before, _, y_before, _ = events[0 if last else i + 1]
-        k = names.index(name)
-        modes.append(after)
-        parts.append(part_at(t, y))
-        here = parts[-1]
-        multiplier = 0.0
-        if k in model.holdable:
-            state = states(model, jnp.asarray(t_next), y_before, tuple(jnp.asarray(m, jnp.int32) for m in before))
-            multiplier = float(model.values(jnp.asarray(t_next), y_before, state)[k])
-        slot, entry = event_slot(model, k, before[k], part_at(t_next, y_before)[k], multiplier)
-        slots.append(slot)
-        entries.append(entry)
-        parts[-1] = here
-        begin.append(t)
-        end.append(t_next + (period if last else 0.0))
-        x.append(np.asarray(jfu.ravel_pytree(y)[0]))
+def _start(model: Model, diary: Diary, seen: tuple, period: float) -> Start:
+    """From each event to the next."""
+    n = len(diary.t)
+    parts_before, parts_after, multipliers = seen
+    guards = []
+    for i in [*range(1, n), 0]:
+        k = int(diary.switch[i])
+        guards.append(event_slot(model, k, diary.modes[0][i, k], int(parts_before[i, k]), float(multipliers[i])))
+    slot, entry = np.array(guards, np.int32).T
     course = Course(
-        np.array(modes, np.int32).reshape(len(modes), -1),
-        np.array(parts, np.int32).reshape(len(modes), -1),
-        np.full(len(modes), EVENT, np.int32),
-        np.array(slots, np.int32),
-        np.array(entries, np.int32),
-        np.asarray(len(modes), np.int32),
+        diary.modes[1].astype(np.int32),
+        parts_after[:n].astype(np.int32),
+        np.full(n, EVENT, np.int32),
+        slot,
+        entry,
+        np.asarray(n, np.int32),
     )
-    return Start(course, np.array(begin), np.array(end), np.array(x))
+    return Start(course, diary.t, np.append(diary.t[1:], diary.t[0] + period), diary.states[1])

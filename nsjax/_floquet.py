@@ -1,5 +1,7 @@
 """Floquet multipliers: the eigenvalues of a product of many matrices, along the arcs of an orbit and at its events."""
 
+from typing import Any
+
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -132,8 +134,10 @@ def stability(multipliers: Complex[Array, " n"], autonomous: bool) -> Bool[Array
 
 def trivial(multipliers: Complex[Array, "*batch n"]) -> Bool[Array, "*batch n"]:
     """Which multiplier of an autonomous system is that of a shift along the orbit: the one nearest to 1."""
-    away = jnp.where(jnp.isfinite(multipliers), jnp.abs(multipliers - 1), jnp.inf)
-    return jnp.arange(multipliers.shape[-1]) == jnp.argmin(away, axis=-1, keepdims=True)
+    xp: Any = multipliers.__array_namespace__()  # NumPy's, too
+    finite = xp.isfinite(multipliers)
+    away = xp.where(finite, xp.abs(xp.where(finite, multipliers, 0) - 1), xp.inf)
+    return xp.arange(multipliers.shape[-1]) == xp.argmin(away, axis=-1, keepdims=True)
 
 
 def forwards(

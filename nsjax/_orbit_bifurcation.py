@@ -8,8 +8,9 @@ import numpy as np
 
 from ._cycles import CornerKind
 from ._orbit_curve import OrbitCurve
-from ._orbit_trace import Spot, Test
+from ._orbit_trace import Spot
 from ._pencil import EigenvalueCrossing
+from ._test_function import Test
 from ._types import Y
 
 

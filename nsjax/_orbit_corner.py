@@ -21,9 +21,10 @@ from ._orbit_node import (
     tracer_for,
     with_order,
 )
-from ._orbit_trace import CORNERS, OrbitTracer, Spot, Zero
+from ._orbit_trace import OrbitTracer, Spot, Zero
 from ._return_map import return_map, ReturnMap, Touch, touches_of
 from ._system import impact
+from ._test_function import CORNERS
 
 
 KNOWN = 1e-6  # the digits of a normal form
@@ -97,7 +98,7 @@ def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple
     x[0] = look.x[(last + 1) % n]  # what ends here begins anew
     short = course.take(lap_rows, capacity_for(len(lap_rows)))
     once = tracer_for(tracer, with_order(curve, int(curve.order) // times))
-    u = np.asarray(once.curve.pack(Start(short, np.array(begins), np.array(ends), x), zero.spot.parameter))
+    u = once.curve.pack(Start(short, np.array(begins), np.array(ends), x), zero.spot.parameter)
     border = np.zeros_like(u)
     border[-1] = 1.0
     if (

@@ -77,7 +77,7 @@ class OrbitCurve(eqx.Module):
         value = self.low + u[-m:].reshape(jnp.shape(self.low)) * self.width
         return z[:, 0] * self.time, z[:, 1] * self.time, z[:, 2:] * self.sizes, value
 
-    def pack(self, start: Start, value: Any) -> Array:
+    def pack(self, start: Start, value: Any) -> np.ndarray:
         capacity, n = len(start.course.slot), len(self.sizes)
         z = np.zeros((capacity, n + 2))
         for i in range(capacity):
@@ -86,7 +86,7 @@ class OrbitCurve(eqx.Module):
             if i > j:
                 z[i, :2] = start.end[j]
         z /= np.array([float(self.time)] * 2 + np.asarray(self.sizes).tolist())
-        return jnp.append(jnp.asarray(z).ravel(), jnp.ravel((jnp.asarray(value) - self.low) / self.width))
+        return np.append(z.ravel(), (np.asarray(value) - self.low) / self.width)
 
     def state(self, mode: Array, part: Array) -> State:
         model = self.model

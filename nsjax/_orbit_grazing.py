@@ -6,13 +6,14 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import toms748
 
+from ._bracket import bracketed
 from ._course import capacity_for, Course, EVENT, LEAST, Start, TIME
 from ._orbit_curve import OrbitCurve
-from ._orbit_trace import alike, OrbitTracer, Spot, Test, Zero
+from ._orbit_trace import alike, OrbitTracer, Spot, Zero
 from ._segment_flow import with_parameter
 from ._system import impact
+from ._test_function import Test
 
 
 TANGENTIAL = 0.1  # the rate of a guard, in units of the curve, below which a segment that vanishes may be a grazing
@@ -58,7 +59,7 @@ def touching_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
     ends = np.array(course.ends)
     ends[targets] = LEAST
     start = Start(course._replace(ends=ends), look.begin[kept], look.end[kept], look.x[kept])
-    at = tracer.corrected(start.course, np.asarray(curve.pack(start, zero.spot.parameter)))
+    at = tracer.corrected(start.course, curve.pack(start, zero.spot.parameter))
     found = None if at is None else _zero_along(tracer, at, targets[0])
     if found is None or abs(found.parameter - zero.spot.parameter) > FOUND * float(curve.width):
         return None
@@ -98,7 +99,7 @@ def _cut(tracer: OrbitTracer, spot: Spot, cuts: list[tuple[int, int]]) -> tuple[
     """The orbit with cuts where these guards are least along these segments, at the parameter at which the first of
     them vanishes; and the segments that end with the cuts."""
     start, by_cut = cut_course(tracer.curve, spot, cuts)
-    at = tracer.corrected(start.course, np.asarray(tracer.curve.pack(start, spot.parameter)))
+    at = tracer.corrected(start.course, tracer.curve.pack(start, spot.parameter))
     if at is None:
         return None
     found = _zero_along(tracer, at, by_cut[cuts[0]])
@@ -166,25 +167,20 @@ def _component(curve: OrbitCurve, look: Any, course: Course, i: int, j: int, t: 
 
 def _zero_along(tracer: OrbitTracer, at: Spot, row: int) -> Spot | None:
     """The point of the curve, next to one, at which the guard at the end of a segment vanishes."""
-    seen = {0.0: at}
 
-    def value(s: float) -> float:
-        if s not in seen:
-            here = tracer.at(at, s)
-            if here is None:
-                raise ArithmeticError
-            seen[s] = here
-        return float(seen[s].look.ends[row])
+    def value(spot: Spot) -> float:
+        return float(spot.look.ends[row])
 
-    if value(0.0) == 0:
+    if value(at) == 0:
         return at
     for reach in (1e-3, 1e-2, 5e-2):
         for s in (reach, -reach):
+            far = tracer.at(at, s)
+            if far is None or value(far) * value(at) > 0:
+                continue
+            seen = {0.0: at, s: far}
             try:
-                if value(s) * value(0.0) <= 0:
-                    root = float(toms748(value, *sorted((0.0, s)), xtol=1e-15, rtol=1e-14, maxiter=60))
-                    value(root)
-                    return seen[root]
+                return seen[bracketed(seen, lambda s: tracer.at(at, s), value)]
             except ArithmeticError:
                 continue
     return None

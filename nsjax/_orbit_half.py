@@ -1,21 +1,22 @@
 """The half-branches that the normal form of a corner foretells, entered next to it."""
 
 import dataclasses
+import functools
 import itertools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._course import same_course, Start, start_from
+from ._course import Diary, same_course, Start, starts_from
 from ._cycles import CornerMap, Cycle
 from ._orbit_curve import OrbitCurve
 from ._orbit_grazing import exactly
 from ._orbit_node import admissible, Half, together, tracer_for, with_order
-from ._orbit_trace import Arc, OrbitTracer, PASSED, Spot, turned
+from ._orbit_trace import Arc, OrbitTracer, Spot, turned
 from ._return_map import Base, follow, frame
 from ._segment_flow import with_parameter
+from ._test_function import PASSED
 
 
 DEPARTURES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-7)  # at which a half-branch is entered: of the parameter, in its interval
@@ -56,7 +57,7 @@ def _entered(tracer: OrbitTracer, spot: Spot, points: list[Base], cycle: Cycle, 
     if near is None or far is None or not same_course(near.course, far.course):
         return None
     values = [spot.parameter + cycle.side * share * distance * float(curve.width) for share in (0.5, 1.0)]
-    before, guess = (np.asarray(curve.pack(s.filled(), v)) for s, v in zip((near, far), values))
+    before, guess = (curve.pack(s.filled(), v) for s, v in zip((near, far), values))
     return tracer.corrected(far.filled().course, guess, (guess - before) / np.linalg.norm(guess - before))
 
 
@@ -96,23 +97,18 @@ def _foretold(curve: OrbitCurve, spot: Spot, points: list[Base], cycle: Cycle, d
     modes = np.stack([points[i % m].mode for i in range(count)]).astype(np.int32)
     lanes = _filled(x, np.full(count, value), begin, end, modes)
     xs, values, begins, stops, held = lanes
-    _, _, events, good = follow(curve, xs, values, np.asarray(spot.look.parameter), begins, stops, held)
-    if not bool(np.all(np.asarray(good)[:count])):
+    reference = np.asarray(spot.look.parameter)
+    _, _, events, good = jax.device_get(follow(curve, xs, values, reference, begins, stops, held))
+    if not np.all(good[:count]):
         return None
     here, there = (with_parameter(curve.model, curve.path, jnp.asarray(v)).system for v in (spot.parameter, value))
     slow = 1.0 if curve.autonomous else float(there.period) / float(here.period)
-    rows = []
+    diaries = []
     for lane in range(count):
-        lap = (lane // m) * period * slow
-        for e in _lane(events, lane):
-            after, before = tuple(e.mode_after.values()), tuple(e.mode_before.values())
-            rows.append((float(e.t) + lap, e.switch, before, after, e.y_before, e.y_after))
-    total = cycle.laps * period * slow
-    return start_from(there, curve.like, rows, begin[0] * slow, total, x[0], modes[0])
-
-
-def _lane(events: Any, lane: int) -> Any:
-    return jax.tree.map(lambda leaf: leaf[lane], jax.device_get(events))
+        diary = Diary.of(jax.tree.map(lambda leaf: leaf[lane], events))
+        diaries.append(diary._replace(t=diary.t + (lane // m) * period * slow))
+    at = begin[0] * slow, cycle.laps * period * slow, modes[0], x[0]
+    return starts_from(curve.model, curve.like, [there], [functools.reduce(Diary.joined, diaries)], [at])[0]
 
 
 def _filled(*columns: np.ndarray) -> list[np.ndarray]:

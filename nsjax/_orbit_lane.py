@@ -7,21 +7,18 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._course import Course, EVENT, FREE, LEAST
-from ._floquet import trivial
+from ._course import Course
 from ._orbit_curve import OrbitCurve
 from ._orbit_look import Look, step_on
+from ._orbit_trace import FIRST, SHORTEST, TURN, TURNED
+from ._test_function import BRANCH, branch_value, CIRCLE, circle_values, corner_tests, corner_values, PASSED, Test
 from ._types import Scalar
 
 
-FIRST, SHORTEST = 1e-3, 1e-9  # steps, in units of the curve
-TURN, TURNED = 0.15, 0.5  # the angles between tangents that are aimed at, and allowed
 TRIES = 40  # to locate one zero
+EACH = 4  # orbits computed for each point, on average, at most
 # What a lane is doing, and how it ended.
 STARTING, STEPPING, LOCATING, ENDED, LOST, NO_ORBIT = range(6)
-PASSED = ("fold", "branch point", "flip", "Neimark-Sacker")  # zeros through which the branch goes on
-ENDS = ("low", "high")
-CORNERS = ("tangency", "margin", "duration", "grazing")  # of each segment, the last of each guard too
 
 
 class Row(NamedTuple):
@@ -58,6 +55,7 @@ class Lane(NamedTuple):
     off: Array
     tries: Int[Array, ""]
     end: Scalar  # distance in this step of the first zero at which the branch ends
+    last: Int[Array, ""]  # of which test that is
     arc: Scalar  # length of the curve so far
     rows: Row
     arcs: Float[Array, " points"]
@@ -66,39 +64,18 @@ class Lane(NamedTuple):
     work: Int[Array, ""]  # orbits computed
 
 
-def names(rows: int, slots: int) -> list[tuple[str, int, int]]:
-    """What each test function is: its kind, its segment, its guard."""
-    out = [(kind, 0, 0) for kind in (*ENDS, *PASSED)]
-    out += [(kind, i, 0) for kind in CORNERS[:-1] for i in range(rows)]
-    return out + [(CORNERS[-1], i, j) for i in range(rows) for j in range(slots)]
+def lane_tests(rows: int, slots: int) -> list[Test]:
+    """The test functions, in the order of `values_of`."""
+    return [Test("low"), Test("high"), *corner_tests(rows, slots), Test("fold"), BRANCH, *CIRCLE]
 
 
 def values_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Array:
-    """The test functions; those of corners are positive as long as the orbit is one."""
-    rows = len(look.begin)
-    index = jnp.arange(rows, dtype=course.num.dtype)
-    real, after = index < course.num, jnp.where(index >= course.num - 1, 0, index + 1)
-    ends = jnp.asarray(course.ends)
-    event = real & (ends == EVENT)
-    uncut = (
-        real & (course.num > 1) & (ends != LEAST) & (ends[jnp.where(index == 0, course.num - 1, index - 1)] != LEAST)
-    )
-    one = jnp.ones_like(look.begin)
-    rates = jnp.where(event & (ends[after] != FREE), -look.rates, one)
-    margins = jnp.where(event & jnp.isfinite(look.margins), look.margins, one)
-    lengths = jnp.where(uncut, (look.end - look.begin) / curve.time, one)
-    guards = jnp.where(real[:, None] & jnp.isfinite(look.between), look.between, 1.0)
-    sign, size = look.branch
-    singular = sign * jnp.exp(jnp.clip(size - log, -300, 300))
-    rho = look.multipliers
-    counts = jnp.isfinite(rho) & ~(trivial(rho) & curve.autonomous)
-    flip = jnp.prod(jnp.where(counts, (1 + rho) / (1 + jnp.abs(rho)).astype(rho.dtype), 1)).real
-    first, second = jnp.triu_indices(len(rho), 1)
-    off = rho[first] * rho[second] - 1
-    pairs = jnp.prod(jnp.where(counts[first] & counts[second], off / (1 + jnp.abs(off)).astype(rho.dtype), 1)).real
     share = look.u[-1]
-    head = jnp.stack([share, 1 - share, look.tangent[-1], singular, flip, pairs])
-    return jnp.concatenate([head, rates, margins, lengths, guards.ravel()])
+    corners, there = corner_values(curve, look, course, look.between)
+    smooth = jnp.stack([look.tangent[-1], branch_value(look, log)])
+    circle = circle_values(look.multipliers, curve.autonomous)
+    ends = jnp.stack([share, 1 - share])
+    return jnp.concatenate([ends, jnp.where(there, corners, 1), smooth, circle])
 
 
 def place_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Place:
@@ -125,17 +102,17 @@ def follow_lane(
     blank = jax.eval_shape(lambda: place_of(curve, step_on(curve, course, u, border, zero, u), course, zero))
     at = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)._replace(u=u, tangent=border)
     rows = jax.tree.map(lambda x: jnp.zeros((points, *x.shape), x.dtype), blank.row)
-    index = jnp.arange(len(at.values))
-    ends = (index < len(ENDS)) | (index >= len(ENDS) + len(PASSED))
+    tests = lane_tests(len(course.slot), len(curve.model.slots))
+    ends = jnp.asarray([test != BRANCH and test.kind not in PASSED for test in tests])
     lane = Lane(
         at=at, far=at, length=zero, doing=jnp.where(found, STARTING, NO_ORBIT).astype(jnp.int32),
         wanted=jnp.zeros_like(ends), target=none, near=jnp.zeros(2, u.dtype), off=jnp.zeros(2, u.dtype), tries=none,
-        end=jnp.full_like(zero, jnp.inf), arc=zero, rows=rows, arcs=jnp.zeros(points, u.dtype),
+        end=jnp.full_like(zero, jnp.inf), last=none, arc=zero, rows=rows, arcs=jnp.zeros(points, u.dtype),
         kinds=jnp.full(points, -1, jnp.int32), count=none, work=none,
     )  # fmt: skip
 
     def going(lane: Lane) -> Array:
-        return (lane.doing <= LOCATING) & (lane.count < points) & (lane.work < 4 * points)
+        return (lane.doing <= LOCATING) & (lane.count < points) & (lane.work < EACH * points)
 
     def step(lane: Lane) -> Lane:
         moved = _moved(curve, course, lane, ends, upwards, max_step)
@@ -243,8 +220,8 @@ def _located(lane: Lane, here: Place, good: Array, s: Scalar, ends: Array, max_s
     closed = ~good | (value == 0) | (near[1] - near[0] < 1e-14) | (jnp.abs(s - jnp.where(left, a, b)) < 1e-13)
     closed = closed | (tries >= TRIES)
     done = lane._replace(near=near, off=off, tries=tries)
-    ending = closed & ends[lane.target]
-    end = jnp.where(ending, jnp.minimum(lane.end, s), lane.end)
+    ending = closed & ends[lane.target] & (s < lane.end)
+    end, last = jnp.where(ending, s, lane.end), jnp.where(ending, lane.target, lane.last)
     done = _written(done, here.row, lane.arc + s, lane.target, closed & good)
     wanted = lane.wanted & ~(closed & (jnp.arange(len(ends), dtype=lane.target.dtype) == lane.target))
     over = closed & ~jnp.any(wanted)
@@ -256,6 +233,7 @@ def _located(lane: Lane, here: Place, good: Array, s: Scalar, ends: Array, max_s
         doing=jnp.where(ended, ENDED, jnp.where(passes, STEPPING, LOCATING)).astype(jnp.int32),
         wanted=wanted,
         end=end,
+        last=last,
         arc=lane.arc + jnp.where(passes, lane.length, 0),
     )
     aimed = _aimed(after)

@@ -5,12 +5,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import toms748
 
+from ._bracket import bracketed
 from ._orbit_curve import linearised
 from ._orbit_grazing import cut_course
 from ._orbit_surface import AbstractLocus, cleared, CUSP, DELTA, Locus, Place, RESONANCES, seen_at
-from ._orbit_trace import CORNERS, FIRST, SHORTEST, Spot, Test, TURN
+from ._orbit_trace import FIRST, SHORTEST, Spot, TURN, TURNED
+from ._test_function import BRANCH, CORNERS, Test
 
 
 FAILED = (ArithmeticError, KeyError, np.linalg.LinAlgError)  # where an orbit, or what is asked of it, is not found
@@ -48,7 +49,7 @@ def trace(locus: AbstractLocus, place: Place, max_step: float, max_points: int) 
         try:
             after = locus.place(locus.step(place, length), place.along, place.heading)
             turn = float(np.arccos(np.clip(place.along @ after.along, -1, 1)))
-            if turn > 0.5:
+            if turn > TURNED:
                 raise ArithmeticError("it turns too much")
             found = _met(locus, place, after, length)
         except FAILED:
@@ -100,7 +101,7 @@ def _met(locus: AbstractLocus, place: Place, after: Place, length: float) -> lis
             continue
         if test.kind in (*CORNERS, "low", "high") and new[test] > 0:
             continue  # it comes from where it could not be: a start on the point itself
-        found.append(_located(locus, place, length, test))
+        found.append(_located(locus, place, after, length, test))
     found = [met for met in found if _told(locus, met)]
     rank = {kind: i for i, kind in enumerate(RANK)}
     found.sort(key=lambda met: met.s)
@@ -126,23 +127,21 @@ def _told(locus: AbstractLocus, met: Met) -> bool:
     return bool(pair or double)
 
 
-def _located(locus: AbstractLocus, place: Place, length: float, test: Test) -> Met:
-    seen: dict[float, Spot] = {0.0: place.spot}
+def _located(locus: AbstractLocus, place: Place, after: Place, length: float, test: Test) -> Met:
+    seen: dict[float, Spot] = {0.0: place.spot, length: after.spot}
 
-    def value(s: float) -> float:
-        here = place
-        if s not in seen:
-            seen[s] = locus.step(place, s)
-        if test == CUSP:
-            here = locus.place(seen[s], place.along, place.heading)
-        return locus.watched(dataclasses.replace(here, spot=seen[s]))[test]
+    def step(s: float) -> Spot:
+        return locus.step(place, s)
 
-    s, regular = length / 2, test.kind != "branch"
+    def value(spot: Spot) -> float:
+        here = locus.place(spot, place.along, place.heading) if test == CUSP else dataclasses.replace(place, spot=spot)
+        return locus.watched(here)[test]
+
+    s, regular = length / 2, test != BRANCH
     try:
         if regular:
             rough = test.kind == "guard"  # the least of samples
-            s = float(toms748(value, 0.0, length, xtol=1e-5 * length if rough else 1e-14, rtol=1e-14, maxiter=60))
-            value(s)
+            s = bracketed(seen, step, value, 1e-5 * length if rough else 1e-14)
             # Where the zeros of the test function cross others of its own, as at a corner at which the orbits turn
             # round with it, points of the curve are known less and less well.
             regular = locus.place(seen[s], place.along).slope > DEGENERATE * place.slope
@@ -160,14 +159,14 @@ def _located(locus: AbstractLocus, place: Place, length: float, test: Test) -> M
 
 
 def _interpolated(
-    locus: AbstractLocus, place: Place, s: float, length: float, test: Test, value: Callable[[float], float]
+    locus: AbstractLocus, place: Place, s: float, length: float, test: Test, value: Callable[[Spot], float]
 ) -> Met:
     """A point at which the equations are singular, by polynomials through points of the curve on both sides of it."""
     shares, values, spots = [], [], []
     for share in (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0):
         try:
             here = locus.step(place, s + 0.5 * length * share)
-            values.append(value(s + 0.5 * length * share))
+            values.append(value(here))
         except FAILED:
             continue
         shares.append(share)
@@ -198,7 +197,7 @@ def _cut(locus: Locus, spot: Spot, test: Test) -> Spot | None:
     own = locus.test
     if own.kind in (*CORNERS, "grazing") and row <= own.row:
         own = own._replace(row=own.row + 1)
-    u = np.asarray(locus.curve.pack(start, spot.look.parameter))
+    u = locus.curve.pack(start, spot.look.parameter)
     border = np.linalg.svd(np.asarray(linearised(locus.curve, start.course, u)))[2][-2:]
     try:
         first, second = (dataclasses.replace(locus, test=t) for t in (own, Test("grazing", row)))

@@ -162,6 +162,9 @@ def look_at(curve: OrbitCurve, u: Array, border: Array, course: Course, origin: 
 
     zeros = structural_zeros(model.system, jnp.where((index < course.num)[:, None], mode, mode[:1]))
     found = floquet(factors, zeros, curve.autonomous)
+    free = jnp.any((course.ends == FREE) & (index < course.num))
+    either = zip(_infinitely_unstable(n, curve.autonomous), found)
+    monodromy, multipliers, stable = (jnp.where(free, x, y) for x, y in either)
 
     # Along the way.
     theta = jnp.asarray(THETA, u.dtype)
@@ -184,10 +187,16 @@ def look_at(curve: OrbitCurve, u: Array, border: Array, course: Course, origin: 
     wrong = jnp.max(jnp.abs(f))
     good = (good | (wrong < TOLERANCE)) & jnp.all(jnp.isfinite(tangent))
     return Look(
-        u, tangent, good, value, period, begin, end, x, last, factors, *found,
+        u, tangent, good, value, period, begin, end, x, last, factors, monodromy, multipliers, stable,
         rates, values, margins, least, where, most, spots, between, rise, orders, low, high, mean, square, ts, xs,
         branch, wrong,
     )  # fmt: skip
+
+
+def _infinitely_unstable(n: int, autonomous: bool) -> tuple[Array, Array, Array]:
+    """Monodromy matrix, multipliers, and whether it is stable, of an orbit that slides on a surface that repels."""
+    rest = [1.0] * autonomous + [jnp.nan] * (n - 1 - autonomous)
+    return jnp.full((n, n), jnp.inf), jnp.array([jnp.inf, *rest], complex), jnp.array(False)
 
 
 def _least(

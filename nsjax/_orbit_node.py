@@ -11,7 +11,8 @@ from ._cycles import Cycle
 from ._orbit_bifurcation import OrbitBifurcation, OrbitHalf
 from ._orbit_curve import linearised, OrbitCurve, state_at
 from ._orbit_look import advance
-from ._orbit_trace import alike, CORNERS, midpoint, OrbitTracer, Spot, spot_of, tests, turned, Zero
+from ._orbit_trace import alike, midpoint, OrbitTracer, Spot, spot_of, told_by, turned, Zero
+from ._test_function import CORNERS
 
 
 BRANCHING = (3e-3, 1e-3, 1e-2, 3e-4, 1e-4, 1e-5)  # lengths of the step by which a branch is entered along its direction
@@ -93,7 +94,7 @@ def _along(spot: Spot, direction: np.ndarray) -> Spot:
 
 def admissible(curve: OrbitCurve, spot: Spot) -> bool:
     scale = float(spot.look.branch[1])
-    return all(v > -1e-9 for t, v in tests(curve, spot, scale).items() if t.kind in CORNERS)
+    return all(v > -1e-9 for t, v in told_by(curve, spot, scale).items() if t.kind in CORNERS)
 
 
 def _repeated(spot: Spot, times: int, period: float) -> tuple[Course, Start]:
@@ -115,7 +116,7 @@ def flip_at(tracer: OrbitTracer, name: str, spot: Spot) -> Node | None:
     curve = tracer.curve
     course, start = _repeated(spot, 2, float(spot.look.period))
     twice = tracer_for(tracer, with_order(curve, 2 * int(curve.order)))
-    u = np.asarray(twice.curve.pack(start, spot.parameter))
+    u = twice.curve.pack(start, spot.parameter)
     kernel = _kernel(twice, course, u)
     # On the orbit twice the parameter moves; on what is born here it does not, to first order.
     direction = np.array([-kernel[1][-1], kernel[0][-1]]) @ kernel
@@ -145,7 +146,7 @@ def branch_point_at(tracer: OrbitTracer, name: str, spot: Spot) -> Node | None:
         course = spot.course.take(rows, capacity_for(len(rows))) if n > 1 else spot.course
         once = tracer_for(tracer, with_order(curve, int(curve.order) // 2))
         start = Start(course, spot.look.begin[: len(rows)], spot.look.end[: len(rows)], spot.look.x[: len(rows)])
-        base = once.corrected(course, np.asarray(once.curve.pack(start, spot.parameter)))
+        base = once.corrected(course, once.curve.pack(start, spot.parameter))
         if base is None:
             return None
         node = flip_at(once, name, base)

@@ -18,7 +18,8 @@ from jaxtyping import Array
 from ._course import Course
 from ._orbit_curve import OrbitCurve
 from ._orbit_surface import AbstractLocus, DELTA, interval_tests, Place, seen_at
-from ._orbit_trace import circle_tests, corner_tests, Spot, Test
+from ._orbit_trace import of_circle, of_corners, Spot
+from ._test_function import Test
 
 
 ISOLATED = 1e-2  # curvature of β along the curve, over that across it: zero where there is a curve
@@ -131,5 +132,5 @@ class BranchLocus(AbstractLocus):
 
     def watched(self, place: Place) -> dict[Test, float]:
         spot = place.spot
-        out: dict[Test, Any] = interval_tests(spot) | corner_tests(self.curve, spot) | circle_tests(self.curve, spot)
+        out: dict[Test, Any] = interval_tests(spot) | of_corners(self.curve, spot) | of_circle(self.curve, spot)
         return self.told(out)

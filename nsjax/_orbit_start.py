@@ -8,9 +8,10 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from ._arcs import model_of
-from ._course import Start, start_of
+from ._course import Start, starts_of
 from ._orbit import Orbit
 from ._orbit_curve import guard_sizes, OrbitCurve
 from ._parameter import get_parameter, parameter_path
@@ -58,9 +59,8 @@ def curve_and_start(
             f"`system`, but is ({low:.6g}, {high:.6g})."
         )
     model = model_of(system, orbit.t0, orbit.y0)
-    start = start_of(system, orbit)
+    (start,) = starts_of(model, [orbit])
     sizes = sizes_of(orbit, scale)
-    order = 1 if system.period is None else int(round(float(orbit.period) / float(system.period)))
     curve = OrbitCurve(
         model=model,
         path=path,
@@ -70,7 +70,7 @@ def curve_and_start(
         sizes=sizes,
         time=np.asarray(float(orbit.period)),
         guard_sizes=np.ones(len(model.slots)),
-        order=np.asarray(order, np.int32),
+        order=order_of(system, orbit),
         normal=np.zeros_like(sizes),
         reference=np.zeros_like(sizes),
         how=how,
@@ -80,6 +80,12 @@ def curve_and_start(
     curve = dataclasses.replace(curve, normal=normal, reference=reference)
     curve = dataclasses.replace(curve, guard_sizes=guard_sizes(curve, start))
     return dataclasses.replace(curve, exact=_exact(curve, start, value)), start
+
+
+def order_of(system: System, orbit: Orbit) -> Int[np.ndarray, ""]:
+    """In how many periods of the forcing it closes."""
+    order = 1 if system.period is None else round(float(orbit.period) / float(system.period))
+    return np.asarray(order, np.int32)
 
 
 def _exact(curve: OrbitCurve, start: Start, value: float) -> int:

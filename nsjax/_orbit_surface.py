@@ -12,12 +12,14 @@ import numpy as np
 from jaxtyping import Array
 
 from ._course import capacity_for, Course, EVENT, LEAST, Start
+from ._floquet import trivial
 from ._orbit_bifurcation import Origin
 from ._orbit_curve import linearised, OrbitCurve
 from ._orbit_look import advance, Look, zeros_at_begin
-from ._orbit_trace import branch_test, circle_tests, corner_tests, CORNERS, Spot, spot_of, Test
+from ._orbit_trace import of_circle, of_corners, Spot, spot_of
 from ._parameter import get_parameter
 from ._segment_flow import THETA, with_parameter
+from ._test_function import branch_value, CIRCLE, CORNERS, Test
 
 
 DELTA = 1e-4  # of the differences that give the gradient of a test function, in units of the surface
@@ -85,7 +87,7 @@ def untouched(origin: Origin) -> Origin:
     ends[[(i - 1) % n for i in gone]] = LEAST
     shorter = course._replace(ends=ends).take(kept, capacity_for(len(kept)))
     start = Start(shorter, look.begin[kept], look.end[kept], xs[kept])
-    u = np.asarray(curve.pack(start, spot.parameter))
+    u = curve.pack(start, spot.parameter)
     border = np.linalg.svd(np.asarray(linearised(curve, shorter, u)))[2][-1]
     found = advance(curve, shorter, u, border, np.zeros(()), u, np.asarray(True))
     if not bool(found.good):
@@ -127,7 +129,7 @@ class AbstractLocus(abc.ABC):
         names = {t for row in rows for t in row}
         silent = {t for t in names if all(abs(row.get(t, 0.0)) < ALWAYS for row in rows)}
         if "rate" in {t.kind for t in (self.test, *silent)}:
-            silent |= {Test("flip"), Test("Neimark-Sacker")}  # saltation matrices that are limits make them no numbers
+            silent |= {*CIRCLE}  # saltation matrices that are limits make them no numbers
         return dataclasses.replace(self, silent=frozenset(silent))
 
 
@@ -150,8 +152,7 @@ class Locus(AbstractLocus):
             return projection(spot)
         if test.kind == "grazing":
             return float(look.ends[test.row] / self.curve.guard_sizes[spot.course.slot[test.row]])
-        tests = corner_tests if test.kind in CORNERS else circle_tests
-        return tests(self.curve, spot)[test]
+        return (of_corners if test.kind in CORNERS else of_circle)(self.curve, spot)[test]
 
     def place(self, spot: Spot, along: np.ndarray | None = None, heading: np.ndarray | None = None) -> Place:
         frame = spot.look.tangent
@@ -193,15 +194,15 @@ class Locus(AbstractLocus):
 
     def watched(self, place: Place) -> dict[Test, float]:
         spot, test = place.spot, self.test
-        out = interval_tests(spot) | corner_tests(self.curve, cleared(self.curve, spot))
+        out = interval_tests(spot) | of_corners(self.curve, cleared(self.curve, spot))
         out[Test("fold")] = projection(spot)
-        out[Test("branch")] = branch_test(spot, self.scale)
-        out |= circle_tests(self.curve, spot)
+        out[Test("branch")] = float(branch_value(spot.look, self.scale))
+        out |= of_circle(self.curve, spot)
         if test.kind == "fold":
             frame = spot.look.tangent
             out[CUSP] = float((frame @ place.along) @ frame[:, -2:] @ place.heading)
         if test.kind == "Neimark-Sacker":
-            rho = spot.trivial(self.curve.autonomous)
+            rho = spot.multipliers[~(trivial(spot.multipliers) & self.curve.autonomous)]
             pairs = [(abs(a * b - 1), (a + b).real / 2) for i, a in enumerate(rho) for b in rho[:i]]
             out |= {name: min(pairs)[1] + off for name, off in RESONANCES.items()}
         return self.told(out)

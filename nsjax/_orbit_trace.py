@@ -6,34 +6,32 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy.optimize import toms748
 
-from ._course import Course, EVENT, FREE, LEAST
+from ._bracket import bracketed
+from ._course import Course
 from ._orbit_curve import OrbitCurve, state_at
 from ._orbit_look import advance, least_between, Look
 from ._segment_flow import NODES, THETA
+from ._test_function import (
+    BRANCH,
+    branch_value,
+    CIRCLE,
+    circle_values,
+    corner_tests,
+    corner_values,
+    CORNERS,
+    PASSED,
+    Test,
+)
 
 
 FIRST, SHORTEST = 1e-3, 1e-9  # steps, in units of the curve
 UNSEEN = 1e-6  # steps that are not shortened any more for the sake of a branch point
-TURN = 0.15  # the angle between tangents that is aimed at
+TURN, TURNED = 0.15, 0.5  # the angles between tangents that are aimed at, and allowed
 NEAR = 1e-5  # zeros that are nearer to each other, in steps, are one
 VANISHES = 1e-6  # a test function that is smaller, where another one vanishes
 SAME = 1e-6  # two orbits at one parameter that are nearer are one
-PASSED = ("fold", "flip", "Neimark-Sacker")  # bifurcations through which the branch goes on as it is
-CORNERS = ("duration", "margin", "rate", "guard")  # in the order in which what vanishes together is told by the first
-
-
-class Test(NamedTuple):
-    """A function whose zero is looked for: what it is, of which segment, and of which guard."""
-
-    kind: str
-    row: int = 0
-    slot: int = 0
-
-
-BRANCH = Test("branch")
-SINGULAR = 1e-3  # its value, beside that a step before, at which another zero is that of a branch point
+SINGULAR = 1e-3  # the test function of branch points, over its value a step before, where another zero is that of one
 ASIDE = 1e-2  # from a branch point, in steps: a fold that is nearer is the branch point's own
 
 
@@ -51,16 +49,9 @@ class Spot:
     def parameter(self) -> float:
         return float(self.look.parameter)
 
-    def trivial(self, autonomous: bool) -> np.ndarray:
-        """The multipliers without that of a shift along an autonomous orbit."""
-        finite = np.where(np.isfinite(self.multipliers), np.abs(self.multipliers - 1), np.inf)
-        return np.delete(self.multipliers, np.argmin(finite)) if autonomous else self.multipliers
-
 
 def spot_of(curve: OrbitCurve, look: Look, course: Course) -> Spot:
     look = _exact(curve, jax.device_get(look), course)
-    if FREE in course.ends[: int(course.num)]:
-        return _infinitely_unstable(curve, look, course)
     return Spot(look, course, look.multipliers, bool(look.stable), look.monodromy)
 
 
@@ -81,12 +72,6 @@ def _exact(curve: OrbitCurve, look: Look, course: Course) -> Look:
     return look._replace(least=least)
 
 
-def _infinitely_unstable(curve: OrbitCurve, look: Look, course: Course) -> Spot:
-    n = len(curve.sizes)
-    rest = [1.0] * curve.autonomous + [np.nan] * (n - 1 - curve.autonomous)
-    return Spot(look, course, np.array([np.inf, *rest], complex), False, np.full((n, n), np.inf))
-
-
 def midpoint(curve: OrbitCurve, spot: Spot, rows: Iterable[int]) -> tuple[float, np.ndarray, np.ndarray]:
     """Time, state and mode in the middle of the longest of some segments, if possible one that no surface holds: beside
     it orbits are near each other, as they need not be beside an event or where static friction holds."""
@@ -102,51 +87,23 @@ def midpoint(curve: OrbitCurve, spot: Spot, rows: Iterable[int]) -> tuple[float,
     return float(t), np.asarray(x), mode
 
 
-def tests(curve: OrbitCurve, spot: Spot, scale: float) -> dict[Test, float]:
-    """Functions of the points of a branch; those of `CORNERS` are positive as long as the orbit is one."""
-    look = spot.look
-    out = {Test("low"): float(look.u[-1]), Test("high"): 1 - float(look.u[-1])}
-    out |= corner_tests(curve, spot)
-    out[Test("fold")] = float(look.tangent[-1])
-    out[BRANCH] = branch_test(spot, scale)
-    return out | circle_tests(curve, spot)
+def told_by(curve: OrbitCurve, spot: Spot, log: float) -> dict[Test, float]:
+    """All test functions of a point; the determinant is divided by exp(log)."""
+    share = float(spot.look.u[-1])
+    ends = {Test("low"): share, Test("high"): 1 - share}
+    smooth = {Test("fold"): float(spot.look.tangent[-1]), BRANCH: float(branch_value(spot.look, log))}
+    return ends | of_corners(curve, spot) | smooth | of_circle(curve, spot)
 
 
-def corner_tests(curve: OrbitCurve, spot: Spot) -> dict[Test, float]:
-    look, course = spot.look, spot.course
-    out = {}
-    ends, slots = np.asarray(course.ends), np.asarray(look.least)
-    length = (np.asarray(look.end) - np.asarray(look.begin)) / float(curve.time)
-    rates, margins, n = np.asarray(look.rates), np.asarray(look.margins), int(course.num)
-    for i in range(n):
-        if ends[i] == EVENT:
-            if ends[(i + 1) % n] != FREE:
-                out[Test("rate", i)] = -float(rates[i])
-            if np.isfinite(margins[i]):
-                out[Test("margin", i)] = float(margins[i])
-        if n > 1 and ends[i] != LEAST and ends[i - 1] != LEAST:
-            out[Test("duration", i)] = float(length[i])
-        for j, value in enumerate(slots[i]):
-            if np.isfinite(value):
-                out[Test("guard", i, j)] = float(value)
-    return out
+def of_corners(curve: OrbitCurve, spot: Spot) -> dict[Test, float]:
+    """With the exact least values of guards."""
+    values, there = corner_values(curve, spot.look, spot.course, spot.look.least)
+    names = corner_tests(*spot.look.least.shape)
+    return {names[i]: float(values[i]) for i in np.flatnonzero(there)}
 
 
-def branch_test(spot: Spot, scale: float) -> float:
-    """The determinant of the equations bordered by the tangent, over exp(scale)."""
-    sign, log = np.asarray(spot.look.branch)
-    return float(sign * np.exp(np.clip(log - scale, -300, 300)))
-
-
-def circle_tests(curve: OrbitCurve, spot: Spot) -> dict[Test, float]:
-    """Of the multipliers: where one is -1, and where two have the product 1."""
-    rho = spot.trivial(curve.autonomous)
-    finite = rho[np.isfinite(rho)]
-    pairs = [finite[i] * finite[j] - 1 for i in range(len(finite)) for j in range(i)]
-    return {
-        Test("flip"): float(np.prod((1 + finite) / (1 + np.abs(finite))).real),
-        Test("Neimark-Sacker"): float(np.prod([p / (1 + abs(p)) for p in pairs]).real) if pairs else 1.0,
-    }
+def of_circle(curve: OrbitCurve, spot: Spot) -> dict[Test, float]:
+    return dict(zip(CIRCLE, circle_values(spot.multipliers, curve.autonomous).tolist()))
 
 
 class Zero(NamedTuple):
@@ -215,20 +172,13 @@ class OrbitTracer:
         length = float(a.look.tangent @ (b.look.u - a.look.u))
         seen = {0.0: a, length: b}
 
-        def off(s: float) -> float:
-            if s not in seen:
-                here = self.at(a, s, a.look.u + s / length * (b.look.u - a.look.u))
-                if here is None:
-                    raise ArithmeticError
-                seen[s] = here
-            return seen[s].parameter - value
+        def at(s: float) -> Spot | None:
+            return self.at(a, s, a.look.u + s / length * (b.look.u - a.look.u))
 
         try:
-            s = float(toms748(off, *sorted((0.0, length)), xtol=1e-15, rtol=1e-14, maxiter=60))
-            off(s)
+            return seen[bracketed(seen, at, lambda spot: spot.parameter - value)]
         except (ArithmeticError, ValueError):
             return None
-        return seen[s]
 
     def corrected(self, course: Course, guess: Any, border: Any = None) -> Spot | None:
         """The orbit in a course next to a guess, at the same parameter (or on another plane)."""
@@ -257,7 +207,7 @@ class OrbitTracer:
             turn = np.inf
             if step is not None:
                 turn = float(np.arccos(np.clip(float(spot.look.tangent @ step.look.tangent), -1, 1)))
-            zeros = self.zeros(spot, step, length) if step is not None and turn <= 0.5 else None
+            zeros = self.zeros(spot, step, length) if step is not None and turn <= TURNED else None
             if step is not None and zeros is not None:
                 break
             length /= 2
@@ -287,7 +237,7 @@ class OrbitTracer:
         """The zeros of test functions between two points, in their order, up to the first at which the course ends;
         None if the step must be shorter for them to be told."""
         scale = float(spot.look.branch[1])
-        before, after = (tests(self.curve, p, scale) for p in (spot, step))
+        before, after = (told_by(self.curve, p, scale) for p in (spot, step))
         changed = []
         for test, value in before.items():
             if test not in after or after[test] == 0 or value * after[test] > 0:
@@ -305,7 +255,7 @@ class OrbitTracer:
         for test in lost:
             # Beside a singular point, which another test function may know.
             small = SINGULAR if test == BRANCH else VANISHES
-            at = next((z for z in found if abs(tests(self.curve, z.spot, scale).get(test, np.inf)) < small), None)
+            at = next((z for z in found if abs(told_by(self.curve, z.spot, scale).get(test, np.inf)) < small), None)
             if at is None and (test != BRANCH or length > UNSEEN):
                 return None
             found += [] if at is None else [at._replace(test=test)]
@@ -316,7 +266,7 @@ class OrbitTracer:
         final = next((z for z in found if z.test.kind not in PASSED), None)
         if final is not None:
             # What lies before the end of the course may have changed back beyond it. (At a branch point it may turn.)
-            there = tests(self.curve, final.spot, scale)
+            there = told_by(self.curve, final.spot, scale)
             for test in (t for t in before if t.kind in PASSED and before[t] * there[t] < 0):
                 if test.kind == "fold" and final.test == BRANCH:
                     continue
@@ -348,7 +298,7 @@ class OrbitTracer:
         return first._replace(others=others, side=side)
 
     def value(self, spot: Spot, test: Test, scale: float) -> float:
-        found = tests(self.curve, spot, scale).get(test)
+        found = told_by(self.curve, spot, scale).get(test)
         if found is None:
             raise ArithmeticError(f"{test} is not a number")
         return found
@@ -358,24 +308,20 @@ class OrbitTracer:
         seen: dict[float, Spot] = {0.0: spot, length: step}
         chord = step.look.u - spot.look.u
 
-        def value(s: float) -> float:
-            if s not in seen:
-                here = self.at(spot, s, spot.look.u + s / length * chord)
-                if here is None:
-                    raise ArithmeticError
-                seen[s] = here
-            return self.value(seen[s], test, scale)
+        def at(s: float) -> Spot | None:
+            return self.at(spot, s, spot.look.u + s / length * chord)
 
-        rough, singular = test.kind == "guard", False
+        s, rough = None, test.kind == "guard"
         try:
-            s = toms748(value, 0.0, length, xtol=1e-5 * length if rough else 1e-14, rtol=1e-14, maxiter=60)
-            s = float(s)
-            value(s)
+            xtol = 1e-5 * length if rough else 1e-14
+            s = bracketed(seen, at, lambda here: self.value(here, test, scale), xtol)
         except ArithmeticError:
-            singular = True
-        if singular or test.kind == "branch":
+            pass
+        if s is None or test == BRANCH:
             # Beside its zero the equations are singular: the last that could be solved tells about where.
-            s = min((s for s in seen if s > 0), key=lambda s: abs(tests(self.curve, seen[s], scale).get(test, np.inf)))
+            s = min(
+                (s for s in seen if s > 0), key=lambda s: abs(told_by(self.curve, seen[s], scale).get(test, np.inf))
+            )
             found = self.interpolated(spot, s, length, chord, scale, test)
             return None if found is None else Zero(found[0], test, found[1])
         return Zero(s, test, seen[s])
@@ -388,7 +334,7 @@ class OrbitTracer:
         for share in (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0):
             node = s + 0.5 * length * share
             here = self.at(spot, node, spot.look.u + node / length * chord)
-            if here is not None and test in tests(self.curve, here, scale):
+            if here is not None and test in told_by(self.curve, here, scale):
                 nodes.append(share)
                 spots.append(here)
         if len(nodes) < 4:

@@ -14,7 +14,8 @@ from ._orbit_curve import OrbitCurve
 from ._orbit_grazing import exactly
 from ._orbit_node import admissible, Half, Node, tracer_for
 from ._orbit_record import Recorder
-from ._orbit_trace import alike, Arc, CORNERS, OrbitTracer, PASSED, SAME, Spot, turned
+from ._orbit_trace import alike, Arc, OrbitTracer, SAME, Spot, turned
+from ._test_function import CORNERS, PASSED
 
 
 NEARBY = 10  # points to a corner from where a half-branch was entered

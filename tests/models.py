@@ -269,3 +269,40 @@ def with_change(entry, solver):
     start = jnp.asarray(float(entry.t0)), jax.tree.map(jnp.asarray, entry.y0)
     _, change, sol = jax.jvp(run, start, jax.tree.map(jnp.ones_like, start), has_aux=True)
     return sol, change
+
+
+class Support(nsjax.System):
+    """x'' + c x' + x = cos ωt before a visco-elastic support at x_c, whose damper makes multipliers jump at a touch."""
+
+    c: float = 0.1
+    k_f: float = 4.0
+    c_f: float = 1.0
+    x_c: float = 3.0
+    omega: float = 1.14
+
+    def vector_field(self, t, y, s):
+        force = self.wall(t, y)[1] * (1 + s.wall) / 2
+        return Motion(y.v, jnp.cos(self.omega * t) - self.c * y.v - y.x - force)
+
+    @nsjax.sgn
+    def wall(self, t, y):
+        return y.x - self.x_c, self.k_f * (y.x - self.x_c) + self.c_f * y.v
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+class Duffing(nsjax.System):
+    """x'' + c x' + x + x³ = F cos ωt."""
+
+    c: float = 0.2
+    F: float = 1.0
+    omega: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, self.F * jnp.cos(self.omega * t) - self.c * y.v - y.x - y.x**3)
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from models import Motion
+from models import Motion, Support
 from scipy.optimize import fsolve
 from test_continue_orbit import orbit_of, same_multipliers, stability_agrees, the
 
@@ -17,28 +17,6 @@ from nsjax import continue_orbit
 
 
 mp: Any = reference.mp
-
-
-class Bumper(nsjax.System):
-    """x'' + c x' + x = cos ωt before a visco-elastic support at x_c, whose damper makes multipliers jump at a touch."""
-
-    c: float = 0.1
-    k_f: float = 4.0
-    c_f: float = 1.0
-    x_c: float = 3.0
-    omega: float = 1.14
-
-    def vector_field(self, t, y, s):
-        force = self.wall(t, y)[1] * (1 + s.wall) / 2
-        return Motion(y.v, jnp.cos(self.omega * t) - self.c * y.v - y.x - force)
-
-    @nsjax.sgn
-    def wall(self, t, y):
-        return y.x - self.x_c, self.k_f * (y.x - self.x_c) + self.c_f * y.v
-
-    @property
-    def period(self):
-        return 2 * jnp.pi / self.omega
 
 
 class BumperReference:
@@ -91,11 +69,11 @@ class BumperReference:
     def smooth(self, sign):
         """x_c where the multiplier of orbits with contact is `sign`, next to the corner."""
 
-        def test(contact):
+        def condition(contact):
             m = self.monodromy(contact)
             return 1 - sign * (m[0, 0] + m[1, 1]) + m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
 
-        contact = mp.findroot(test, (mp.mpf("1e-3"), mp.mpf("2e-2")))
+        contact = mp.findroot(condition, (mp.mpf("1e-3"), mp.mpf("2e-2")))
 
         def off(begin, x_c, v):
             y = self.flow(begin, mp.matrix([x_c, v]), begin + contact, True, x_c)
@@ -121,7 +99,7 @@ def bumper(omega, sign, less, **options):
     known = BumperReference(omega, c_f)
     corner = float(known.corner)
     z = complex(known.gain(known.c, 1))
-    system = Bumper(c_f=float(c_f), omega=omega, x_c=corner + 0.3)
+    system = Support(c_f=float(c_f), omega=omega, x_c=corner + 0.3)
     orbit = orbit_of(system, Motion(z.real, -z.imag * omega))
     return continue_orbit(system, orbit, "x_c", (corner - 0.5, corner + 0.5), **options), known
 

@@ -1,5 +1,6 @@
 """Curves of special points of periodic orbits in two parameters, against closed forms and computations by scipy."""
 
+import dataclasses
 import pathlib
 import re
 from typing import Any
@@ -8,7 +9,7 @@ import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import Motion, pid
+from models import Duffing, Motion, pid, Support
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq, fsolve
@@ -29,41 +30,7 @@ def of_kind(branch, kind):
     return found[0]
 
 
-class Duffing(nsjax.System):
-    """x'' + c x' + x + x³ = F cos ωt."""
-
-    c: float = 0.2
-    F: float = 1.0
-    omega: float = 1.0
-
-    def vector_field(self, t, y, s):
-        return Motion(y.v, self.F * jnp.cos(self.omega * t) - self.c * y.v - y.x - y.x**3)
-
-    @property
-    def period(self):
-        return 2 * jnp.pi / self.omega
-
-
-class Wall(nsjax.System):
-    """x'' + c x' + x = cos ωt, before a visco-elastic wall."""
-
-    c: float = 0.05
-    x_c: float = 4.0
-    k_f: float = 1.0
-    c_f: float = 1.0
-    omega: float = 1.15
-
-    def vector_field(self, t, y, s):
-        force = self.wall(t, y)[1] * (1 + s.wall) / 2
-        return Motion(y.v, jnp.cos(self.omega * t) - self.c * y.v - y.x - force)
-
-    @nsjax.sgn
-    def wall(self, t, y):
-        return y.x - self.x_c, self.k_f * (y.x - self.x_c) + self.c_f * y.v
-
-    @property
-    def period(self):
-        return 2 * jnp.pi / self.omega
+WALL = Support(c=0.05, x_c=4.0, k_f=1.0, c_f=1.0, omega=1.15)
 
 
 class Twice(nsjax.System):
@@ -185,7 +152,7 @@ def test_folds_and_cusp(duffing):
 def test_fold_meets_grazing():
     """The linear response touches the wall where its amplitude is the distance. The fold of the orbits with contact
     ends there where their multiplier, with the limit of the saltation matrix, is 1."""
-    branch = branch_of(Wall(), Motion(-3.0, 0.0), "omega", (1.05, 1.35))
+    branch = branch_of(WALL, Motion(-3.0, 0.0), "omega", (1.05, 1.35))
     corner, fold = (next(b for b in branch.bifurcations if b.discontinuous == d) for d in (True, False))
     grazing, folds = (continue_bifurcation(b, "x_c", (0.5, 12.0)) for b in (corner, fold))
     omega, x_c = grazing.values.T
@@ -205,7 +172,7 @@ def test_fold_meets_grazing():
     # A fold at another distance of the wall, found anew.
     i = np.argmin(np.abs(folds.values[:, 1] - 3.3))
     value, distance = folds.values[i]
-    again = branch_of(Wall(x_c=float(distance)), Motion(-2.0, 0.0), "omega", (1.05, 1.35))
+    again = branch_of(dataclasses.replace(WALL, x_c=float(distance)), Motion(-2.0, 0.0), "omega", (1.05, 1.35))
     assert min(abs(b.value - value) for b in again.bifurcations if b.kind == "fold") < 1e-9
 
 

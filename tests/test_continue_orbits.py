@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import Motion, pid
+from models import Duffing, Motion, pid
 
 import nsjax
 from nsjax import continue_orbit, continue_orbits, find_orbit, gallery, sweep
@@ -38,18 +38,6 @@ class Wall(nsjax.System):
         return 2 * jnp.pi / self.omega
 
 
-class Duffing(nsjax.System):
-    force: float = 0.3
-    omega: float = 1.0
-
-    def vector_field(self, t, y, s):
-        return Motion(y.v, self.force * jnp.cos(self.omega * t) - 0.1 * y.v - y.x - y.x**3)
-
-    @property
-    def period(self):
-        return 2 * jnp.pi / self.omega
-
-
 def grazing(gap, zeta=0.05):
     """The frequency below resonance."""
     return np.sqrt(1 - 2 * zeta**2 - np.sqrt((1 - 2 * zeta**2) ** 2 - 1 + 1 / gap**2))
@@ -70,7 +58,7 @@ def walls():
 @pytest.fixture(scope="module")
 def duffing():
     forces = jnp.array([0.2, 0.3, 0.4])
-    orbits = sweep(lambda force: find_orbit(Duffing(force=force), Motion(0.3, 0.0), order=1, **HOW), forces)
+    orbits = sweep(lambda force: find_orbit(Duffing(c=0.1, F=force), Motion(0.3, 0.0), order=1, **HOW), forces)
     return orbits, continue_orbits(orbits, "omega", (0.9, 2.2), points=500)
 
 
