@@ -262,6 +262,25 @@ def _check_impact(
         )
 
 
+def check_autonomous(system: System, t: Scalar, y: Y) -> None:
+    """Of a model without a `period`."""
+    zeros = tuple(jnp.zeros_like(t) for _ in system.switches)
+
+    def seen(t: Scalar) -> Any:
+        surfaces = [
+            (k.guard(system, t, y), k.off_guard(system, t, y)) if isinstance(k, relay) else k.components(system, t, y)
+            for k in system.switches
+        ]
+        return system.vector_field(t, y, system.values(zeros)), surfaces
+
+    if not is_constant(seen, t):
+        name = type(system).__name__
+        raise ValueError(
+            f"`{name}` depends on the time t, but says of no period with which it repeats itself: add a property "
+            "`period`, as `return 2 * jnp.pi / self.omega`."
+        )
+
+
 def check_contacts(model: Model, t: Scalar, y: Y) -> Scalar:
     """Checks that every contact force opens its gap, which depends on numbers.
 

@@ -10,7 +10,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from ._check import check_solve
+from ._check import check_autonomous, check_solve
 from ._cuts import Segment
 from ._forward import forward_only
 from ._jacobian import dense_jacobian
@@ -95,7 +95,8 @@ def find_orbit(
     **Returns:** an `Orbit`. Its result is `RESULTS.tangential_event`, which is no failure, if it grazes a surface: the
     orbit is right, but its multipliers are not defined.
 
-    **Raises:** a runtime error that says whether the search ended in an equilibrium, in a multiple cover of a shorter
+    **Raises:** `ValueError` for a model that depends on the time but has no `period`, and for arguments that do not fit
+    together; a runtime error that says whether the search ended in an equilibrium, in a multiple cover of a shorter
     orbit, or nowhere.
     """
     if order is not None and (not isinstance(order, int) or order < 1):
@@ -125,6 +126,8 @@ def find_orbit(
     system = arrays_of(system, t0.dtype)
     how = dict(solver=solver, stepsize_controller=controller, max_steps=max_steps, max_events=max_events)
     autonomous = system.period is None
+    if autonomous:
+        check_autonomous(system, t0, y0)
     if not autonomous and period is not None:
         raise ValueError("Argument `period` must not be given for a forced system; use `order` for a subharmonic.")
     if autonomous and order not in (1, None):

@@ -155,10 +155,12 @@ class OrbitBifurcation(NamedTuple):
         )  # fmt: skip
 
     @classmethod
-    def end(cls, name: str, spot: Any, curve: Any, surfaces: tuple[str, ...]) -> "OrbitBifurcation":
+    def end(cls, name: str, spot: Any, curve: Any, surfaces: tuple[str, ...], side: int) -> "OrbitBifurcation":
+        """Where the orbits on one side have none nearby to go on to."""
+        below, above = (((1,) if side == s else ()) for s in (-1, 1))
         return cls(
             kind="end", discontinuous=True, criticality=None, evidence="count", by_count="end", by_crossing=None,
-            transition=None, count=((), ()), surfaces=surfaces, crossings=[], halves=[],
+            transition=None, count=(below, above), surfaces=surfaces, crossings=[], halves=[],
             multipliers=(spot.multipliers, spot.multipliers), monodromies=(spot.monodromy, spot.monodromy),
             **_common(name, spot, curve),
         )  # fmt: skip

@@ -49,7 +49,8 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
     curve = tracer.curve
     kind = zero.test.kind
     spot = zero.spot
-    if kind == "guard":
+    shrinks = float(spot.look.period) < KNOWN * float(curve.time)  # to a point
+    if kind == "guard" or shrinks:
         return _end(tracer, name, zero)
     # Several places may be touched at once, by symmetry, and the event happen at some of them only.
     alike = ("duration", "margin") if kind in ("duration", "margin") else (kind,)
@@ -278,5 +279,5 @@ def _end(tracer: OrbitTracer, name: str, zero: Zero) -> Node:
     row = zero.test.row
     slot = zero.test.slot if zero.test.kind == "guard" else int(course.slot[row])
     switch = tracer.curve.model.switches[tracer.curve.model.slots[slot].switch].name
-    made = OrbitBifurcation.end(name, zero.spot, tracer.curve, (switch,))
+    made = OrbitBifurcation.end(name, zero.spot, tracer.curve, (switch,), zero.side)
     return Node(zero.spot, int(tracer.curve.order), [], made)

@@ -108,7 +108,10 @@ def _foretold(curve: OrbitCurve, spot: Spot, points: list[Base], cycle: Cycle, d
         diary = Diary.of(jax.tree.map(lambda leaf: leaf[lane], events))
         diaries.append(diary._replace(t=diary.t + (lane // m) * period * slow))
     at = begin[0] * slow, cycle.laps * period * slow, modes[0], x[0]
-    return starts_from(curve.model, curve.like, [there], [functools.reduce(Diary.joined, diaries)], [at])[0]
+    diary = functools.reduce(Diary.joined, diaries)
+    if curve.autonomous and len(diary.t):  # time counts from the first event, as on the curve
+        diary = diary._replace(t=diary.t - diary.t[0])
+    return starts_from(curve.model, curve.like, [there], [diary], [at])[0]
 
 
 def _filled(*columns: np.ndarray) -> list[np.ndarray]:

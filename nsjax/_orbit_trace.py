@@ -80,7 +80,8 @@ def midpoint(curve: OrbitCurve, spot: Spot, rows: Iterable[int]) -> tuple[float,
     for i in rows:
         held = any(course.mode[i, k] == (1 if k in curve.model.contacts else 0) for k in curve.model.holdable)
         length[i] = (look.end[i] - look.begin[i]) * (1e-6 if held else 1.0)
-    best = next(i for i in length if length[i] >= (1 - 1e-6) * max(length.values()))
+    longest = max(length.values())
+    best = next(i for i in length if length[i] >= longest - 1e-6 * abs(longest))
     t = np.asarray((look.begin[best] + look.end[best]) / 2)
     mode = np.asarray(course.mode[best])
     x = state_at(curve, look.parameter, look.begin[best], t, look.x[best], mode, course.part[best])
@@ -294,7 +295,8 @@ class OrbitTracer:
         several = sorted([zero, *together], key=lambda z: rank.get(z.test.kind, 99))
         first = several[0]
         others = tuple(dict.fromkeys(z.test for z in several[1:]))
-        side = int(np.sign(before.parameter - first.spot.parameter))
+        off = before.parameter - first.spot.parameter
+        side = int(np.sign(off if off else -before.look.tangent[-1]))
         return first._replace(others=others, side=side)
 
     def value(self, spot: Spot, test: Test, scale: float) -> float:

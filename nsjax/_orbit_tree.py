@@ -85,16 +85,14 @@ class OrbitTree:
         return self.nodes[node].halves[number]
 
     def places(self) -> Iterator[Place]:
-        """Of half-branches that nobody has been on."""
+        """Of half-branches that nobody has been on, and that do not leave the interval at once."""
         every = ((i, j) for i, node in enumerate(self.nodes) for j in range(len(node.halves)))
-        return (place for place in every if place not in self.used)
+        return (p for p in every if p not in self.used and 0 <= self.half(p).spot.look.u[-1] <= 1)
 
     def partner(self, place: Place) -> Place | None:
         """On which half-branch it goes on from there; None if that is known already."""
-        node, _ = place
         partner = self.half(place).partner
-        places = ((node, j) for j, half in enumerate(self.nodes[node].halves) if half is partner)
-        return next((place for place in places if place not in self.used), None)
+        return next((p for p in self.places() if self.half(p) is partner), None)
 
 
 @dataclasses.dataclass
@@ -285,4 +283,6 @@ def outwards(arc: Arc) -> Spot:
     places at once the equations are singular, a segment of no length at each going its own way."""
     before, at = arc.spots[-2:]
     chord = at.look.u - before.look.u
+    if not np.any(chord):  # where the orbit shrinks to a point
+        return at
     return dataclasses.replace(at, look=at.look._replace(tangent=chord / np.linalg.norm(chord)))

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool
 from ._filippov import Model, State
 from ._settle import forks, nearly, settle
 from ._solution import RESULTS
-from ._system import frozen, impact, relay
+from ._system import frozen, impact, relay, sgn
 from ._types import Scalar, Y
 
 
@@ -70,6 +70,14 @@ def start_mode(
             modes.append(jnp.where(on[k], 0, jnp.sign(h)).astype(jnp.int32))
             at[k] = on[k]
     state = State(tuple(modes), tuple(parts), tuple(roots))
+    for k, switch in enumerate(model.switches):
+        if isinstance(switch, sgn) and switch.name not in given:
+            # Nearer than an event can be told from the start: the end of a period on a surface is off by rounding.
+            instant = 2 * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + horizon)
+            h = jnp.min(jnp.stack(model.h(k, t, y)))
+            on[k] = at[k] = on[k] | (jnp.abs(h) <= instant * jnp.abs(frozen(model.approach(k, t, y, state))))
+            modes[k] = jnp.where(on[k], 0, modes[k])
+    state = state._replace(mode=tuple(modes))
     for k, gap in beyond.items():
         # Near zero the rounding of h itself is nothing beside that of the terms which once led there.
         soon = AT_ONCE * float(jnp.finfo(t.dtype).eps) ** 0.5 * horizon

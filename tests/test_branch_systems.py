@@ -1,5 +1,6 @@
 """Branches of periodic orbits of systems that are not the thesis's, with answers that are known otherwise."""
 
+import dataclasses
 from typing import Any
 
 import branch_reference
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from models import Motion, Support
+from models import Heat, Motion, Support, Thermostat
 from scipy.optimize import fsolve
 from test_continue_orbit import orbit_of, same_multipliers, stability_agrees, the
 
@@ -252,6 +253,61 @@ class Ball(nsjax.System):
     @property
     def period(self):
         return 2 * jnp.pi / self.omega
+
+
+def test_interval_begins_at_a_corner():
+    """The branch ends there: what lies beyond the corner is outside."""
+    known = BumperReference(1.14, 0.3)
+    corner, z = float(known.corner), complex(known.gain(known.c, 1))
+    system = Support(c_f=0.3, omega=1.14, x_c=corner)
+    orbit = orbit_of(system, Motion(z.real, -z.imag * 1.14))
+    for x_c in (corner, corner + 0.3):
+        start = dataclasses.replace(orbit.system, x_c=jnp.asarray(x_c))
+        branch = continue_orbit(start, orbit, "x_c", (corner, corner + 0.5))
+        assert not branch.others
+        np.testing.assert_allclose([branch.values.min(), branch.values.max()], [corner, corner + 0.5], atol=1e-10)
+        (point,) = branch.special_points
+        assert (point.kind, point.count) == ("none", ((1,), (1,)))
+
+
+def test_start_that_sticks():
+    """The base point lies on the surface, but for rounding: the orbit is as it is from elsewhere."""
+
+    class Dry(nsjax.System):
+        omega: float = 0.45
+
+        def vector_field(self, t, y, s):
+            return Motion(y.v, jnp.cos(self.omega * t) - 0.1 * y.v - y.x - 0.4 * s.friction)
+
+        @nsjax.sgn
+        def friction(self, t, y):
+            return y.v
+
+        @property
+        def period(self):
+            return 2 * jnp.pi / self.omega
+
+    orbit = orbit_of(Dry(), Motion(1.0, 0.0))
+    assert [e.mode_before["friction"] for e in orbit.events] == [0, -1, 0, 1] and int(orbit.mode[0]) == 0
+    branch = continue_orbit(Dry(), orbit, "omega", (0.4, 0.6))
+    assert [b.transition for b in branch.special_points] == ["sliding"] and branch.ends == (
+        "omega = 0.4",
+        "omega = 0.6",
+    )
+
+
+def test_relay():
+    """A thermostat: its period in closed form, from where the orbit shrinks to a point to where it takes for ever."""
+    system = Thermostat()
+    orbit = orbit_of(system, Heat(20.0), period=0.54)
+    branch = continue_orbit(system, orbit, "T_high", (17.0, 40.0))
+    t = branch.values
+    apart = 35 - t > 1e-6  # beyond, T_high has too few digits to know the period by
+    period = np.log(17 / (35 - t[apart])) + np.log((t[apart] - 5) / 13)
+    np.testing.assert_allclose(branch.periods[apart], period, rtol=1e-8, atol=1e-14)
+    np.testing.assert_allclose(t[[0, -1]], [18, 35], atol=1e-11)
+    assert branch.periods[-1] > 30 and [b.kind for b in branch.special_points] == ["end", "end"]
+    assert [b.count for b in branch.special_points] == [((), (1,)), ((1,), ())]
 
 
 @pytest.mark.slow

@@ -307,7 +307,6 @@ def test_grazing_impact():
     assert {int(b.orders[0]) for b in branch.branches} == {1, 2}
 
 
-@pytest.mark.slow
 def test_autonomous_corner():
     """The limit cycle comes to touch the tip of a surface: what damps there only delays it, and nothing jumps."""
     system = VanDerPol()

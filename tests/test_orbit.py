@@ -8,7 +8,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 import reference
-from models import Motion, pid, Plane
+from models import Hammer, Motion, pid, Plane
 
 import nsjax
 from nsjax import find_orbit, fundamental_matrix, gallery, RESULTS
@@ -416,3 +416,9 @@ def test_wrong_arguments(change, message):
 def test_a_period_is_not_given_to_a_forced_system():
     with pytest.raises(ValueError, match="use `order` for a subharmonic"):
         find_orbit(Resonator(), Motion(0.0, 0.0), period=9.0)
+
+
+def test_a_model_that_depends_on_time_has_a_period():
+    """Else what is found repeats a state, but not what drives it."""
+    with pytest.raises(ValueError, match="`Hammer` depends on the time t, but .* add a property `period`"):
+        find_orbit(Hammer(), Motion(1.0, 0.0))
