@@ -75,7 +75,8 @@ def continue_orbit(
     - `orbit`: an `Orbit` of it, from `find_orbit`.
     - `parameter`: the name of the parameter, a field of `system` or of a system within.
     - `interval`: of the parameter.
-    - `scale`: the typical size of each component of the state, like the state; by default what it has along the orbit.
+    - `scale`: the typical size of each component of the state, like the state; by default what it has along the orbit
+        (1 where that is less than 1e-9, as along x = 0).
     - `max_step`: the longest step, in units of `scale`, of the orbit's period, and of the interval.
     - `max_points`: of each arc between two special points.
     - `max_branches`: so many at most; if there are more a warning says so.

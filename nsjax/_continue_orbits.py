@@ -106,7 +106,8 @@ def continue_orbits(
 
     ```python
     def search(x_c):
-        return nsjax.find_orbit(nsjax.gallery.Trilinear(omega=1.15, x_c=x_c), Motion(-0.1, -0.7), order=1, throw=False)
+        start = nsjax.gallery.Motion(-0.1, -0.7)
+        return nsjax.find_orbit(nsjax.gallery.Trilinear(omega=1.15, x_c=x_c), start, order=1, throw=False)
 
     orbits = nsjax.sweep(search, jnp.linspace(0.9, 1.1, 1000))
     branches = nsjax.continue_orbits(orbits, "omega", (1.1, 1.3))

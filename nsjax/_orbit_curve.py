@@ -24,6 +24,9 @@ from ._system import impact, relay
 from ._types import Scalar, Y
 
 
+VANISHES = 1e-8  # an equation in the units of the unknowns
+
+
 class OrbitCurve(eqx.Module):
     """The equations; what is unknown is measured in `sizes` (state), `time`, and `width`, the interval of the parameter
     from `low` on.
@@ -188,8 +191,9 @@ def guard_sizes(curve: OrbitCurve, start: Start) -> np.ndarray:
 
 
 def row_sizes(df: Array) -> Array:
+    """A row that vanishes, as at a branch point of one state that is zero, is not made one of rounding."""
     sizes = jnp.max(jnp.abs(df), axis=1)
-    return jnp.where(sizes == 0, 1, sizes)
+    return jnp.where(sizes < VANISHES, 1, sizes)
 
 
 @eqx.filter_jit

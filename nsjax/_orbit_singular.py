@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ._course import Course
-from ._orbit_curve import OrbitCurve
+from ._orbit_curve import OrbitCurve, row_sizes
 from ._orbit_surface import AbstractLocus, DELTA, interval_tests, Place, seen_at
 from ._orbit_trace import of_circle, of_corners, Spot
 from ._test_function import Test
@@ -50,7 +50,7 @@ class _Frame:
     @classmethod
     def at(cls, curve: OrbitCurve, course: Course, u: np.ndarray) -> "_Frame":
         _, df = map(np.asarray, _equations(curve, course, u, u))
-        sizes = np.maximum(np.max(np.abs(df), axis=1), 1e-300)
+        sizes = np.asarray(row_sizes(df))
         left, _, right = np.linalg.svd(df / sizes[:, None])
         return cls(curve, course, u, sizes, left[:, -1], right[-3:])
 

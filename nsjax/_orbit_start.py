@@ -21,6 +21,7 @@ from ._system import arrays_of, System
 from ._types import Y
 
 
+AT_REST = 1e-9  # a state that varies less is known to few digits only
 Options = tuple[tuple[str, Any], ...]
 
 
@@ -100,7 +101,8 @@ def _exact(curve: OrbitCurve, start: Start, value: float) -> int:
 
 
 def sizes_of(orbit: Orbit, scale: Y | None) -> np.ndarray:
-    """The typical size of each component of the state: half its range along the orbit, unless told."""
+    """The typical size of each component of the state: half its range along the orbit, unless told; of an orbit that is
+    at rest its distance from zero, or one."""
     path = orbit.path(33)
     rows = jax.vmap(jax.vmap(lambda y: jfu.ravel_pytree(y)[0]))(path.y)
     rows = np.asarray(rows).reshape(-1, rows.shape[-1])
@@ -109,8 +111,10 @@ def sizes_of(orbit: Orbit, scale: Y | None) -> np.ndarray:
         if sizes.shape != rows.shape[1:] or not np.all(sizes > 0):
             raise ValueError("Argument `scale` must hold a positive number for each component of the state.")
         return sizes
-    sizes = np.ptp(rows[np.isfinite(rows).all(axis=1)], axis=0) / 2
-    return np.where(sizes > 1e-12 * max(1e-300, sizes.max()), sizes, max(sizes.max(), 1e-300))
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    sizes = np.ptp(rows, axis=0) / 2
+    whole = next((float(size) for size in (sizes.max(), np.abs(rows).max()) if size > AT_REST), 1.0)
+    return np.where(sizes > max(AT_REST, 1e-12 * whole), sizes, whole)
 
 
 def phase_of(curve: OrbitCurve, start: Start) -> tuple[np.ndarray, np.ndarray]:

@@ -3,12 +3,13 @@
 import dataclasses
 import pathlib
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import Array
 from models import Duffing, Motion, pid, Support
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -298,3 +299,48 @@ def test_contacts_that_vanish_by_symmetry():
     np.testing.assert_allclose(np.abs(1 - omega**2 + 0.05j * omega) * x_c, 0.2, atol=1e-10)
     assert np.min(omega) < 0.9 and np.max(omega) > 1.1 and np.max(x_c) > 3.9
     assert curve.kind == "grazing" and set(curve.surfaces) == {"lower", "upper"}
+
+
+class Line(NamedTuple):
+    x: Array
+
+
+class Imperfect(nsjax.System):
+    """x' = (μ + cos(t) / 2) x - x³ + ε: a pitchfork for ε = 0, and none else."""
+
+    mu: float = -0.3
+    epsilon: float = 0.0
+    eta: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Line((self.mu + jnp.cos(t) / 2) * y.x - self.eta * y.x**3 + self.epsilon)
+
+    @property
+    def period(self):
+        return 2 * jnp.pi
+
+
+def test_a_single_branch_point():
+    """It lies on a curve over a parameter that leaves the symmetry, and on none over one that breaks it: over both the
+    orbits are a smooth surface."""
+    branch = branch_of(Imperfect(), Line(0.0), "mu", (-0.5, 0.5))
+    (point,) = branch.bifurcations
+    assert point.kind == "symmetry breaking" and point.value == pytest.approx(0, abs=1e-10)
+    curve = continue_bifurcation(point, "eta", (0.5, 2.0))
+    np.testing.assert_allclose(curve.values[:, 0], 0, atol=1e-10)
+    assert np.ptp(curve.values[:, 1]) == pytest.approx(1.5)
+    with pytest.raises(ValueError, match="beside this symmetry breaking bifurcation, supercritical none was found"):
+        continue_bifurcation(point, "epsilon", (-0.1, 0.1))
+
+
+@pytest.mark.slow
+def test_where_A_B_and_C_meet():
+    """Section 6.8: three curves, each computed on its own, through one point of codimension two."""
+    entry = gallery.entry("6.8")
+    branch = branch_of(entry.system(), entry.y0, "omega", (0.5, 0.8), orbit=dict(order=1))
+    found = [of_kind(branch, "none")]
+    found += [next(b for b in branch.bifurcations if b.discontinuous == d) for d in (False, True)]
+    curves = [continue_bifurcation(b, "f_0", (2.0, 3.0), first=(0.4, 1.2)) for b in found]
+    (first,), (second,), (third,) = (curve.special for curve in curves)
+    np.testing.assert_allclose(second.values, first.values, atol=1e-8)
+    np.testing.assert_allclose(third.values, first.values, atol=1e-8)
