@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from ._crossing import nodes, to_bernstein, to_chebyshev
 from ._filippov import Model, State
+from ._linear import product
 from ._once import once
 from ._series import Series
 from ._step import bernstein, jittered, stack, Step, Stepper, unresolved, Watch, with_multipliers
@@ -162,8 +163,8 @@ def expm(m: Square) -> Square:
     under `vmap` computes all of its five approximants.)
     """
     dtype = m.dtype
-    m2 = m @ m
-    m3, m4 = m2 @ m, m2 @ m2
+    m2 = product(m, m)
+    m3, m4 = product(m2, m), product(m2, m2)
 
     def norm(p: Square) -> Scalar:
         return _largest([sum(jnp.abs(x) for x in column) for column in lax.stop_gradient(p).T])
@@ -177,9 +178,10 @@ def expm(m: Square) -> Square:
     total = float(weights[_TERMS]) * m4
     for k in range(_TERMS - 4, -1, -4):
         block = sum((float(w) * p for w, p in zip(weights[k : k + 4], powers)), jnp.zeros_like(m))
-        total = block + total if k == _TERMS - 4 else block + m4 @ total
+        total = block + total if k == _TERMS - 4 else block + product(m4, total)
     count = halvings.astype(jnp.int32)
-    return lax.while_loop(lambda c: c[0] < count, lambda c: (c[0] + 1, c[1] @ c[1]), (jnp.zeros_like(count), total))[1]
+    start = (jnp.zeros_like(count), total)
+    return lax.while_loop(lambda c: c[0] < count, lambda c: (c[0] + 1, product(c[1], c[1])), start)[1]
 
 
 def _sampled(
