@@ -102,7 +102,7 @@ def continue_orbit(
         ```
     - `progress`: whether to write to the standard error stream how far it is.
     - `solver`, `stepsize_controller`, `max_steps`: as for `solve`, of each segment; by default Dopri8 with tolerances
-        of 1e-12.
+        of 1e-12. (Where the field is affine in the state between events, segments are matrix exponentials anyway.)
 
     **Returns:** the `OrbitBranch` through `orbit`, with the others in `OrbitBranch.others`.
 

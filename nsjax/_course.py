@@ -87,7 +87,7 @@ def slot_of(model: Model, k: int, holding: bool, part: int) -> int:
 def event_slot(model: Model, k: int, mode: Any, part: int, multiplier: float) -> tuple[int, int]:
     """The guard, and its component, at whose zero switch k has its event in `mode`: `part` is the component of h that
     is at zero, `multiplier` the value of the switch if it holds."""
-    if k in model.holdable and mode == (1 if k in model.contacts else 0):
+    if k in model.holdable and model.held(k, mode):
         return slot_of(model, k, True, 1 if k in model.contacts or multiplier > 0 else -1), 0
     if isinstance(model.switches[k], sgn) and model.parts[k] > 1 and mode < 0:
         return slot_of(model, k, False, 0), part

@@ -125,7 +125,7 @@ class EquilibriumCurve(Curve):
         for k, what, i in self.slots():
             m, part = mode[:, k]
             number = self.model.parts[k]
-            held = k in self.model.holdable and m == (1 if k in self.model.contacts else 0)
+            held = k in self.model.holdable and self.model.held(k, m)
             if what == "relay":
                 signs.append(-1 if i == m else 0)
             elif what == "h" and held:

@@ -131,6 +131,10 @@ class Model(eqx.Module):
         """Whether `mode` of switch k holds the solution on its surface."""
         return mode == (1 if k in self.contacts else 0)
 
+    def holds(self, mode: Any) -> bool:
+        """Whether one of its switches does; of a mode that is known."""
+        return any(bool(self.held(k, mode[k])) for k in self.holdable)
+
     def level(self, k: int, t: Scalar, y: Y, state: State) -> Scalar:
         """What its multiplier keeps at zero: the active component of h; for a contact dh/dt, as forces act on that."""
 

@@ -129,13 +129,17 @@ class OrbitBifurcation(NamedTuple):
             below, above = tuple(sorted((1, *below))), tuple(sorted((1, *above)))
         if kind == "fold":
             below, above = ((), (1, 1)) if side > 0 else ((1, 1), ())
+        alone = kind == "Neimark-Sacker"  # of what is born there nothing is periodic
+        if alone:
+            below = above = (1,)
         criticality = None
         born = [h for h in halves if h.laps == 2] if kind == "flip" else _twins(halves)
         if kind in ("flip", "symmetry breaking") and born:
             criticality = "supercritical" if born[0].stable else _criticality(spot, born[0])
         return cls(
             kind=kind, discontinuous=False, criticality=criticality, evidence="both" if halves else "crossing",
-            by_count=kind, by_crossing=(kind,), transition=None, count=(below, above), surfaces=(), crossings=[],
+            by_count="none" if alone else kind, by_crossing=(kind,), transition=None, count=(below, above), surfaces=(),
+            crossings=[],
             multipliers=(spot.multipliers, spot.multipliers), monodromies=(spot.monodromy, spot.monodromy),
             halves=halves, origin=Origin(Test(SMOOTH.get(kind, "branch")), spot, curve), **_common(name, spot, curve),
         )  # fmt: skip

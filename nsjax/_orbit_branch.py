@@ -188,7 +188,7 @@ class OrbitStrand:
 
     points: tuple[Point, ...] = ()
     special: tuple[tuple[int, OrbitBifurcation], ...] = ()
-    end: str = ""
+    end: str = "here, so far"
 
     def then(self, point: Point) -> "OrbitStrand":
         return dataclasses.replace(self, points=(*self.points, point))

@@ -222,11 +222,7 @@ def described(
 
 def _held(curve: OrbitCurve, spot: Spot) -> int:
     """How many segments a surface holds."""
-    mode, held = (
-        spot.course.mode[: int(spot.course.num)],
-        {k: int(k in curve.model.contacts) for k in curve.model.holdable},
-    )
-    return sum(any(row[k] == value for k, value in held.items()) for row in mode)
+    return sum(curve.model.holds(spot.course.mode[i]) for i in spot.course.rows)
 
 
 def _multipliers(monodromy: np.ndarray) -> np.ndarray:

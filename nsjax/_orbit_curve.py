@@ -51,10 +51,7 @@ class OrbitCurve(eqx.Module):
 
     def on(self, course: Course) -> "OrbitCurve":
         """With flows as the modes of a course allow."""
-        held = {k: int(k in self.model.contacts) for k in self.model.holdable}
-        modes = np.asarray(course.mode)[: int(course.num)]
-        slides = any(bool(np.any(modes[:, k] == value)) for k, value in held.items())
-        return dataclasses.replace(self, slides=slides)
+        return dataclasses.replace(self, slides=any(self.model.holds(course.mode[i]) for i in course.rows))
 
     @property
     def flow(self) -> SegmentFlow:

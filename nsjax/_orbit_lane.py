@@ -82,7 +82,7 @@ def place_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Plac
     # In the middle of the longest segment, if possible of one that no surface holds.
     mode, held = jnp.asarray(course.mode), jnp.zeros(len(look.begin), bool)
     for k in curve.model.holdable:
-        held |= mode[:, k] == (1 if k in curve.model.contacts else 0)
+        held |= curve.model.held(k, mode[:, k])
     length = jnp.where(jnp.arange(len(held), dtype=course.num.dtype) < course.num, look.end - look.begin, -jnp.inf)
     i = jnp.argmax(length * jnp.where(held, 1e-6, 1.0))
     middle = look.ts.shape[1] // 2

@@ -252,9 +252,8 @@ def zeros_at_begin(curve: OrbitCurve, model: Model, course: Course) -> Array:
         free = jnp.ones(len(index), bool)
         order = jnp.ones(len(index))
         if k in model.holdable:
-            held = 1 if k in model.contacts else 0
-            free = mode[:, k] != held
-            slid = mode_before[:, k] == held
+            free = ~model.held(k, mode[:, k])
+            slid = model.held(k, mode_before[:, k])
             if k in model.contacts:
                 order = jnp.where(slid, 3, 1)
             elif not model.static(k):

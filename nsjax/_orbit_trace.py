@@ -78,8 +78,7 @@ def midpoint(curve: OrbitCurve, spot: Spot, rows: Iterable[int]) -> tuple[float,
     look, course = spot.look, spot.course
     length = {}
     for i in rows:
-        held = any(course.mode[i, k] == (1 if k in curve.model.contacts else 0) for k in curve.model.holdable)
-        length[i] = (look.end[i] - look.begin[i]) * (1e-6 if held else 1.0)
+        length[i] = (look.end[i] - look.begin[i]) * (1e-6 if curve.model.holds(course.mode[i]) else 1.0)
     longest = max(length.values())
     best = next(i for i in length if length[i] >= longest - 1e-6 * abs(longest))
     t = np.asarray((look.begin[best] + look.end[best]) / 2)

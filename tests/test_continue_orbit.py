@@ -188,6 +188,8 @@ def test_forced_stick_slip(belt):
     assert b.count == ((), (1, 1, 2, 4)) and b.evidence == "both"
     assert [crossing.kind for crossing in b.crossings] in (["-1", "+1"], ["+1", "-1"])
     assert c.count in (((1, 2), (1,)), ((1,), (1, 2)))
+    torus = the(belt, POINTS["6.9 Neimark-Sacker III"].at)
+    assert (torus.count, torus.by_count, torus.evidence) == (((1,), (1,)), "none", "crossing")
     # I to V are one closed curve; VI and VII one of period 4, from B to the flip; VIII has period 8.
     closed, *others = belt.branches
     assert "closed" in " ".join(closed.ends) and len(closed.special) == 6
