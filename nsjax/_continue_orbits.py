@@ -112,6 +112,7 @@ def continue_orbits(
     orbits = nsjax.sweep(search, jnp.linspace(0.9, 1.1, 1000))
     branches = nsjax.continue_orbits(orbits, "omega", (1.1, 1.3))
     print(branches)
+    plt.plot(branches.values.T, branches.high.x.T)
     ```
 
     The equations are those of `continue_orbit`, in one compiled loop for all lanes. Folds, flips and Neimark-Sacker

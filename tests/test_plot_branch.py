@@ -1,5 +1,7 @@
 """Diagrams of branches of periodic orbits: what is drawn of branches whose numbers are known."""
 
+import dataclasses
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -96,8 +98,11 @@ def texts(ax):
 # The diagram.
 
 
-def test_stretches_end_where_stability_changes(forced):
-    ax = plot.orbit_diagram(forced, labels=LABELS)
+@pytest.mark.parametrize("inside", [True, False])
+def test_stretches_end_where_stability_changes(forced, inside):
+    """At the flip whether a multiplier is in the circle or not is rounding."""
+    stable = np.where(np.arange(7) == 5, inside, forced.stable)
+    ax = plot.orbit_diagram(dataclasses.replace(forced, stable=stable), labels=LABELS)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("ω [rad/s]", "max |x| [m]")
     stable = lines(ax, "stable periodic orbit")
     assert [tuple(line[[0, -1], 0]) for line in stable] == [(1.0, 1.5), (1.9, 2.0), (1.5, 1.2)]

@@ -21,9 +21,7 @@ def stretches(
     ax: "Axes", x: np.ndarray, y: np.ndarray, kinds: np.ndarray, styles: Mapping[Any, Any], style: dict[str, Any]
 ) -> None:
     """Lines, each of one kind from end to end, in the line style, with the label, and perhaps further style, that
-    `styles[kind]` says. A change between
-    two points is at the first of them, where these are one corner seen from both sides, and at the second, where that
-    is the special point."""
+    `styles[kind]` says. A line ends at the first point of another kind."""
     start = 0
     for end in range(1, len(x) + 1):
         if end < len(x) and kinds[end] == kinds[start]:

@@ -216,7 +216,11 @@ def _measure_label(measure: Measure, branch: OrbitBranch, labels: Labels) -> str
 def _kinds(branch: OrbitBranch) -> np.ndarray:
     """Of each point, its key in `STYLES`."""
     infinite = np.isinf(branch.multipliers).any(axis=1)
-    return np.where(~branch.admissible, 3, np.where(branch.stable, 0, np.where(infinite, 2, 1)))
+    kinds = np.where(~branch.admissible, 3, np.where(branch.stable, 0, np.where(infinite, 2, 1)))
+    for special, i in zip(branch.special, branch.indices):
+        if not special.discontinuous and 0 <= i < len(kinds) - 1:
+            kinds[i] = kinds[i + 1]  # where a multiplier is on the circle the new kind begins
+    return kinds
 
 
 def _special_points(branch: OrbitBranch) -> Iterator[tuple[OrbitBifurcation, int, int]]:
