@@ -20,11 +20,12 @@ from ._orbit_look import Look
 from ._orbit_node import Half, itinerary, Node
 from ._orbit_record import Measures, Recorder
 from ._orbit_start import curve_and_start, options
-from ._orbit_trace import Arc, OrbitTracer, Spot, Test, Zero
+from ._orbit_trace import Arc, OrbitTracer, Spot, Zero
 from ._orbit_tree import Exit, OrbitExplorer, OrbitTree, Walk
 from ._parameter import get_parameter, parameter_path
 from ._progress import ProgressLine
 from ._system import System
+from ._test_function import Test
 from ._types import Y
 
 
