@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.flatten_util as jfu
 import numpy as np
 from jaxtyping import Complex, Float
@@ -13,6 +12,7 @@ from ._orbit_bifurcation import OrbitBifurcation
 from ._orbit_corner import is_impact
 from ._orbit_curve import OrbitCurve
 from ._orbit_locus import FAILED, LAST, Met, trace, Trail
+from ._orbit_record import states_of
 from ._orbit_singular import BranchLocus
 from ._orbit_surface import CUSP, lifted, Locus, RESONANCES, surfaces_of, touches
 from ._orbit_trace import midpoint, Spot
@@ -220,7 +220,7 @@ def continue_bifurcation(
         periods=np.array([float(s.look.period) for s in spots]),
         multipliers=np.stack([multipliers(s) for s in spots]),
         ts=np.array([t for t, _, _ in bases]),
-        ys=jax.tree.map(np.asarray, jax.vmap(unravel)(np.stack([x for _, x, _ in bases]))),
+        ys=states_of(surface.like, np.stack([x for _, x, _ in bases])),
         special=tuple(codimension_two(i, m) for i, m in known),
         indices=tuple(i for i, _ in known),
         ends=(ends[0], ends[1]),
