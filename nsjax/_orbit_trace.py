@@ -263,30 +263,39 @@ class OrbitTracer:
         branching = [z.s for z in found if z.test == BRANCH]
         found = [z for z in found if z.test.kind != "fold" or all(abs(z.s - s) > ASIDE * length for s in branching)]
         found.sort(key=lambda zero: zero.s)
+        near = NEAR * length + 1e-9
         final = next((z for z in found if z.test.kind not in PASSED), None)
         if final is not None:
-            # What lies before the end of the course may have changed back beyond it. (At a branch point it may turn.)
-            there = told_by(self.curve, final.spot, scale)
+            # What lies before the end of the course may have changed back beyond it, or at the end itself: it is looked
+            # at a little before that. (At a branch point it may turn.)
+            s, last = self.short_of(spot, final, 2 * near)
+            there = told_by(self.curve, last, scale)
             for test in (t for t in before if t.kind in PASSED and before[t] * there[t] < 0):
                 if test.kind == "fold" and final.test == BRANCH:
                     continue
                 if any(z.test == test and z.s <= final.s for z in found):
                     continue
-                zero = self.located(spot, final.spot, final.s, test, scale)
+                zero = self.located(spot, last, s, test, scale)
                 found += [] if zero is None else [zero]
             found.sort(key=lambda zero: zero.s)
         out: list[Zero] = []
         for zero in found:
             final = zero.test.kind not in PASSED
             if final:
-                together = [z for z in found if abs(z.s - zero.s) < NEAR * length + 1e-9 and z is not zero]
+                together = [z for z in found if abs(z.s - zero.s) < near and z is not zero]
                 out.append(self.told(spot, zero, together))
                 break
             out.append(zero)
         if out and out[-1].test.kind in (*CORNERS, "branch"):
             # A test function may pass its zero together with the corner's; it is the corner's then.
-            out = [z for z in out[:-1] if out[-1].s - z.s > NEAR * length + 1e-9] + out[-1:]
+            out = [z for z in out[:-1] if out[-1].s - z.s > near] + out[-1:]
         return out
+
+    def short_of(self, spot: Spot, zero: Zero, off: float) -> tuple[float, Spot]:
+        """The point so far before a zero on the way from another point; if there is none, the zero."""
+        s = zero.s - off
+        here = None if s <= 0 else self.at(spot, s, spot.look.u + s / zero.s * (zero.spot.look.u - spot.look.u))
+        return (zero.s, zero.spot) if here is None else (s, here)
 
     def told(self, before: Spot, zero: Zero, together: list[Zero]) -> Zero:
         """What vanishes at one point, by the first of `CORNERS`."""
