@@ -113,8 +113,10 @@ def sizes_of(orbit: Orbit, scale: Y | None) -> np.ndarray:
         return sizes
     rows = rows[np.isfinite(rows).all(axis=1)]
     sizes = np.ptp(rows, axis=0) / 2
-    whole = next((float(size) for size in (sizes.max(), np.abs(rows).max()) if size > AT_REST), 1.0)
-    return np.where(sizes > max(AT_REST, 1e-12 * whole), sizes, whole)
+    largest, away = sizes.max(), np.abs(rows).max()
+    if largest <= AT_REST:
+        return np.full_like(sizes, away if away > AT_REST else 1.0)
+    return np.where(sizes > 1e-12 * largest, sizes, largest)
 
 
 def phase_of(curve: OrbitCurve, start: Start) -> tuple[np.ndarray, np.ndarray]:
