@@ -263,7 +263,7 @@ def _check_impact(
 
 
 def check_autonomous(system: System, t: Scalar, y: Y) -> None:
-    """Of a model without a `period`."""
+    """Checks that a model without a `period` does not depend on the time."""
     zeros = tuple(jnp.zeros_like(t) for _ in system.switches)
 
     def seen(t: Scalar) -> Any:
@@ -276,8 +276,8 @@ def check_autonomous(system: System, t: Scalar, y: Y) -> None:
     if not is_constant(seen, t):
         name = type(system).__name__
         raise ValueError(
-            f"`{name}` depends on the time t, but says of no period with which it repeats itself: add a property "
-            "`period`, as `return 2 * jnp.pi / self.omega`."
+            f"`{name}` depends on the time t, but has no `period`: add a property `period`, that of its forcing, as "
+            "`return 2 * jnp.pi / self.omega`."
         )
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import Motion, pid
+from models import Motion, pid, Stop
 
 import nsjax
 from nsjax import continue_orbit, find_orbit, gallery
@@ -253,30 +253,6 @@ def test_mistakes(change, message):
         continue_orbit(system, orbit, **given)
 
 
-class Stop(nsjax.System):
-    """x'' + c x' + x = cos ωt, x <= gap with restitution e."""
-
-    e: float = 0.7
-    c: float = 0.1
-    gap: float = 0.3
-    omega: float = 3.0
-
-    def vector_field(self, t, y, s):
-        return Motion(y.v, jnp.cos(self.omega * t) - self.c * y.v - y.x - s.stop)
-
-    @nsjax.impact
-    def stop(self, t, y):
-        return self.gap - y.x
-
-    @stop.restitution
-    def stop(self):
-        return self.e
-
-    @property
-    def period(self):
-        return 2 * jnp.pi / self.omega
-
-
 class VanDerPol(nsjax.System):
     """A self-excited mass before a visco-elastic wall."""
 
@@ -297,7 +273,7 @@ class VanDerPol(nsjax.System):
 @pytest.mark.slow
 def test_grazing_impact():
     """A square-root corner: the linear orbit comes to touch the stop; beyond, it and orbits with impacts are found."""
-    system = Stop()
+    system = Stop(gap=0.3, omega=3.0)
     branch = continue_orbit(system, orbit_of(system, Motion(-0.12, 0.0)), "omega", (2.0, 3.1), max_laps=2)
     square = np.roots([1, system.c**2 - 2, 1 - 1 / system.gap**2]).max()  # |1 - ω² + i c ω| = 1 / gap
     point = the(branch, np.sqrt(square))

@@ -7,8 +7,7 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import pid
-from test_thesis_orbits import Stop
+from models import pid, Stop
 
 from nsjax import find_orbit, gallery, is_okay, solve, sweep
 

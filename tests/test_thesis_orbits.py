@@ -6,38 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import orbit_reference
 import pytest
-from models import Motion, pid
+from models import Motion, pid, Stop
 
 import nsjax
 from nsjax import find_orbit, gallery, RESULTS
 
 
 METHOD = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-13), max_steps=8192, max_events=16)
-
-
-class Stop(nsjax.System):
-    """x'' + c x' + x = f_0 cos ωt, x <= gap with restitution e."""
-
-    e: float = 0.7
-    c: float = 0.1
-    f_0: float = 1.0
-    gap: float = 0.2
-    omega: float = 1.3
-
-    def vector_field(self, t, y, s):
-        return Motion(y.v, self.f_0 * jnp.cos(self.omega * t) - self.c * y.v - y.x - s.stop)
-
-    @nsjax.impact
-    def stop(self, t, y):
-        return self.gap - y.x
-
-    @stop.restitution
-    def stop(self):
-        return self.e
-
-    @property
-    def period(self):
-        return 2 * jnp.pi / self.omega
 
 
 def cases(system, reference, keys, slow):
