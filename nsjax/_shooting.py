@@ -19,7 +19,7 @@ from ._implicit import find_root
 from ._orbit import distance, fractions, judge, Orbit, ravel
 from ._solution import Events, is_okay, RESULTS
 from ._solve import solve
-from ._system import frozen, System
+from ._system import frozen, relay, System
 from ._types import Scalar, Y
 from ._variational import arcs, monodromy_by_arcs
 
@@ -99,7 +99,10 @@ def shoot(
     points = jax.vmap(ravel)(sol.ys)
     error = distance(points[-1], x)
     size = 1 + jnp.max(jnp.abs(x))
-    good = converged & (error <= 1e3 * tol * size) & is_okay(sol.result)
+    # A relay has a memory: its mode must come back with the state.
+    relays = [k for k, switch in enumerate(system.switches) if isinstance(switch, relay)]
+    closes = jnp.all(jnp.asarray([sol.mode0[k] == sol.mode1[k] for k in relays], bool))
+    good = converged & (error <= 1e3 * tol * size) & is_okay(sol.result) & closes
     result = judge(good, x, points[:-1], autonomous, order)
     if autonomous:
         # Where Newton's method ends near an equilibrium, its Jacobian is singular and it seldom says that it converged.

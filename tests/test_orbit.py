@@ -422,3 +422,35 @@ def test_a_model_that_depends_on_time_has_a_period():
     """Else what is found repeats a state, but not what drives it."""
     with pytest.raises(ValueError, match="`Hammer` depends on the time t, but .* add a property `period`"):
         find_orbit(Hammer(), Motion(1.0, 0.0))
+
+
+class Feedback(nsjax.System):
+    """x'' + 0.1 x' + x = cos 0.7 t - 0.3 (2 r - 1), with a relay r of hysteresis."""
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, jnp.cos(0.7 * t) - 0.1 * y.v - y.x - 0.3 * (2 * s.r - 1))
+
+    @nsjax.relay
+    def r(self, t, y):
+        return y.x - 0.2
+
+    @r.off
+    def r(self, t, y):
+        return -0.2 - y.x
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / 0.7
+
+
+def test_the_mode_of_a_relay_comes_back():
+    """Within the hysteresis there is a state that comes back, but with the relay on where it was off."""
+    orbit = find_orbit(Feedback(), Motion(1.0, 0.0), **METHOD)
+    sol = orbit.solve(saveat=dfx.SaveAt(ts=orbit.t0 + orbit.period * jnp.linspace(0, 1, 400)))
+    i = int(np.flatnonzero((np.abs(sol.ys.x) < 0.1) & (sol.ys.v < 0))[0])  # on, on its way to be switched off
+    guess, t0 = jax.tree.map(lambda y: y[i], sol.ys), sol.ts[i]
+    found = find_orbit(Feedback(), guess, t0=t0, mode={"r": 1}, **METHOD)
+    assert int(found.mode[0]) == 1
+    np.testing.assert_allclose(found.multipliers, orbit.multipliers, rtol=1e-8)
+    off = find_orbit(Feedback(), guess, t0=t0, mode={"r": 0}, method="shooting", throw=False, **METHOD)
+    assert not bool(nsjax.is_okay(off.result))
