@@ -1,17 +1,20 @@
 """Mistakes in a model or in the arguments of `solve`, found before anything is integrated."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from diffrax._root_finder import use_stepsize_tol
 from jax.core import Tracer
 
 from ._exponential import Exponential
 from ._filippov import Model, State
+from ._save import in_order
 from ._structure import is_affine, is_constant
 from ._system import impact, relay, sgn, System
 from ._types import Scalar, Y
@@ -76,6 +79,8 @@ def check_solve(
     for name in ("solver_state", "controller_state", "made_jump"):
         if getattr(saveat, name):
             raise ValueError(f"Argument `saveat` must not ask for `{name}`, which a flow with events does not have.")
+    _check_times(saveat, t0, t1)
+    check_direction(system, t1 < t0)
     if isinstance(solver, Exponential) and isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
         raise ValueError(
             "Argument `adjoint` must not be `RecursiveCheckpointAdjoint` for `Exponential`, whose matrix exponential "
@@ -83,6 +88,23 @@ def check_solve(
         )
     controller = _controller(controller, dtype)
     return y0, t0, t1, _implicit(solver, controller, adjoint), controller, _given(system, mode)
+
+
+def _check_times(saveat: dfx.SaveAt, t0: Scalar, t1: Scalar) -> None:
+    """Checks the times at which the solution is to be saved, where all of them are known (else `_integrate` does)."""
+    ts = getattr(saveat.subs, "ts", None)
+    if ts is None or any(isinstance(t, Tracer) for t in (ts, t0, t1)):
+        return
+    times = np.asarray(ts, t0.dtype)
+    if times.ndim != 1:
+        raise ValueError(f"Argument `saveat` must have a vector of times `ts`, but its shape is {times.shape}.")
+    if len(times) and not in_order(times, np.asarray(t0), np.asarray(t1)):
+        bad = times[~np.isfinite(times)] if not np.isfinite(times).all() else times[(times - t0) * (times - t1) > 0]
+        got = f"{bad[0]}" if len(bad) else "times in another order; sort them, `jnp.sort(ts)`"
+        raise ValueError(
+            f"Argument `saveat` must have times `ts` that follow one another from t0 = {float(t0):.10g} to t1 = "
+            f"{float(t1):.10g}, but got {got}."
+        )
 
 
 def _implicit(solver: Any, controller: Any, adjoint: Any) -> Any:
@@ -198,13 +220,32 @@ def check_model(system: System, t: Scalar, y: Y, direction: Scalar) -> Scalar:
             _check_guard(name, f"{switch.name}.off", switch.off_guard, system, t, y)
             if isinstance(switch.guard(system, t, y), tuple) or isinstance(switch.off_guard(system, t, y), tuple):
                 raise ValueError(f"`{name}.{switch.name}` is a relay: its surfaces must be scalars, not tuples.")
-            t = eqx.error_if(
-                t, direction < 0, f"`{name}.{switch.name}` is a relay, whose memory cannot be run backwards."
-            )
         else:
             assert isinstance(switch, impact)
             _check_impact(name, k, switch, system, t, y, field, zeros)
-    return t
+    obstacle = one_way(system)
+    return eqx.error_if(t, direction < 0, obstacle) if obstacle else t
+
+
+def one_way(system: System) -> str | None:
+    """What keeps a system from being run backwards, if anything does."""
+    for switch in system.switches:
+        name = f"`{type(system).__name__}.{switch.name}`"
+        if isinstance(switch, relay):
+            return f"{name} is a relay, whose memory cannot be run backwards in time."
+        if isinstance(switch, impact) and switch.reset_fn is not None and switch.inverse_fn is None:
+            return (
+                f"{name} has a reset, which does not tell the state before it from the one after it; to run it "
+                f"backwards in time, give the state before it by `@{switch.name}.inverse`."
+            )
+    return None
+
+
+def check_direction(system: System, backwards: Any) -> None:
+    """Raises for a system that cannot be run backwards, where it is known that it is to be."""
+    obstacle = one_way(system)
+    if obstacle and not isinstance(backwards, Tracer) and backwards:
+        raise ValueError(obstacle)
 
 
 def _check_guard(owner: str, name: str, guard: Any, system: System, t: Scalar, y: Y) -> None:
@@ -245,15 +286,18 @@ def _check_impact(
             f"`{owner}.{name}` is an impact: give it either `@{name}.reset` (the state after it) or "
             f"`@{name}.restitution` (Newton's coefficient e)."
         )
+    if switch.inverse_fn is not None and switch.reset_fn is None:
+        raise ValueError(
+            f"`{owner}.{name}.inverse` undoes a reset, but there is no `@{name}.reset`; Newton's law needs none."
+        )
     if switch.reset_fn is not None:
-        reset = switch.reset_fn
-        after = jax.eval_shape(lambda: reset(system, t, y))
-        want = jax.eval_shape(lambda: y)
-        if jax.tree.structure(after) != jax.tree.structure(want) or _shape(after) != _shape(want):
-            raise ValueError(
-                f"`{owner}.{name}.reset` must return a state of the structure {_shape(want)}, but "
-                f"returned {_shape(after)}."
-            )
+        for part, fn in (("reset", switch.reset_fn), ("inverse", switch.inverse_fn or switch.reset_fn)):
+            after, want = jax.eval_shape(partial(fn, system, t, y)), jax.eval_shape(lambda: y)
+            if jax.tree.structure(after) != jax.tree.structure(want) or _shape(after) != _shape(want):
+                raise ValueError(
+                    f"`{owner}.{name}.{part}` must return a state of the structure {_shape(want)}, but returned "
+                    f"{_shape(after)}."
+                )
     elif is_constant(lambda sk: field(zeros[:k] + (sk,) + zeros[k + 1 :]), zeros[k]):
         raise ValueError(
             f"`{owner}.{name}.restitution` needs the direction of the impulse, which is that of the contact force "

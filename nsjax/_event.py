@@ -152,6 +152,9 @@ def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> tuple[Y, Y]:
     assert isinstance(switch, impact)
     if switch.reset_fn is not None:
         out = switch.reset_fn(model.system, t * model.direction, y)
+        if switch.inverse_fn is not None:
+            undone = switch.inverse_fn(model.system, t * model.direction, y)
+            out = jax.tree.map(lambda a, b: jnp.where(model.direction > 0, a, b), out, undone)
         return out, jax.tree.map(lambda a, b: jnp.abs(a) + jnp.abs(b), y, out)
     assert switch.restitution_fn is not None
     e = jnp.asarray(switch.restitution_fn(model.system), t.dtype)

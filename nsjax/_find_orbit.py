@@ -10,7 +10,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from ._check import check_autonomous, check_solve
+from ._check import check_autonomous, check_direction, check_solve
 from ._cuts import Segment
 from ._forward import forward_only
 from ._jacobian import dense_jacobian
@@ -124,6 +124,7 @@ def find_orbit(
         raise ValueError("Arguments `segments` and `pieces` are for `method='segments'`, but it is 'shooting'.")
     if not isinstance(pieces, int) or not 1 <= pieces <= 64:
         raise ValueError(f"Argument `pieces` must be an integer from 1 to 64, but got {pieces!r}.")
+    check_direction(system, backward)
     system = arrays_of(system, t0.dtype)
     how = dict(solver=solver, stepsize_controller=controller, max_steps=max_steps, max_events=max_events)
     autonomous = system.period is None

@@ -49,6 +49,10 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "does so is not affine in the state. Take `nsjax.Taylor()` or a Runge-Kutta solver."
     )
     nonfinite_field = "The vector field or an indicator function returned a value that is not finite (NaN or infinity)."
+    wrong_save_times = (
+        "The times of `SaveAt(ts=...)` must be finite, lie between `t0` and `t1`, and follow one another in the "
+        "direction of the integration."
+    )
     wrong_mode = "Argument `mode` places the start on one side of a surface, but `y0` lies clearly on the other."
     start_penetrates = (
         "The start lies beyond an impact surface: h < 0 there. Put `y0` where h >= 0, or change the sign of h."
@@ -210,6 +214,11 @@ class Itinerary(eqx.Module):
         return " -> ".join(", ".join(f"{n} {m:+d}" for n, m in row.items()) for row in self)
 
 
+def _clipped(x: Array, low: Any, high: Any) -> Array:
+    """Within the bounds, and still with the derivative of `x` on them."""
+    return x + jax.lax.stop_gradient(jnp.clip(x, low, high) - x)
+
+
 class Solution(eqx.Module):
     """The solution of a piecewise-smooth system.
 
@@ -227,8 +236,7 @@ class Solution(eqx.Module):
         example 2.5; static friction that holds with |λ| > 1), or it runs backwards and slides or rests. Derivatives are
         those among solutions of the same choice.
 
-    With `SaveAt(dense=True)`, `sol(t)` is the state at any time; at the instant of an event it is the state before
-    with `left=True` (the default) and the state after with `left=False`.
+    With `SaveAt(dense=True)`, `sol(t)` is the state at a time, or at each of an array of times; see `evaluate`.
     """
 
     system: System
@@ -253,16 +261,52 @@ class Solution(eqx.Module):
         return Itinerary(self.mode0, e.switch, e.mode_after, e.num, e.names)
 
     def evaluate(self, t: Any, left: bool = True) -> Y:
-        """The state at time `t` (scalar); at an event the one before it, or after it with `left=False`."""
+        """The state at any time between `t0` and `t1`.
+
+        **Arguments:**
+
+        - `t`: a time, or an array of them [time].
+        - `left`: at an event, whether the state before it is wanted (the default) or the one after it.
+
+        **Returns:** the state; its leaves have the shape of `t` in front. Where a time lies outside of the solution
+        they are NaN.
+
+        **Raises:** `ValueError` for a solution without dense output, and for concrete times outside of the solution.
+        """
         if self.dense is None:
             raise ValueError("Dense output was not kept; call `solve` with `saveat=SaveAt(dense=True)`.")
         starts, stops, points, direction, steps = self.dense
-        s = jnp.asarray(t, starts.dtype) * direction
-        i = jnp.searchsorted(stops, s, side="left" if left else "right")
-        i = jnp.clip(i, 0, jnp.maximum(steps - 1, 0))
-        length = stops[i] - starts[i]
-        u = jnp.where(length > 0, (s - starts[i]) / jnp.where(length > 0, length, 1), 1.0)
-        return bernstein(jax.tree.map(lambda p: p[i], points), u)
+        if stops.ndim != 1:
+            raise ValueError(
+                "This is a batch of solutions: evaluate them lane by lane, `jax.vmap(lambda sol: sol(t))(solutions)`."
+            )
+        t = jnp.asarray(t, starts.dtype)
+        first, last = self.t0 * direction, self.t1 * direction
+        # Times such as 0.1 + 0.2 are off by rounding, which is not meant.
+        slack = 4 * float(jnp.finfo(starts.dtype).eps) * (jnp.abs(first) + jnp.abs(last))
+        outside = ~((t * direction >= first - slack) & (t * direction <= last + slack))
+        if not isinstance(outside, jax.core.Tracer) and outside.any():
+            wrong = np.ravel(np.asarray(t)[np.asarray(outside)])
+            raise ValueError(
+                f"Argument `t` must lie between t0 = {float(self.t0):.10g} and t1 = {float(self.t1):.10g}, but got "
+                f"{wrong[0]:.10g}" + (f" and {len(wrong) - 1} other times outside." if len(wrong) > 1 else ".")
+            )
+
+        def at(s: Scalar) -> Y:
+            i = jnp.searchsorted(stops, s, side="left" if left else "right")
+            i = jnp.clip(i, 0, jnp.maximum(steps - 1, 0))
+            length = stops[i] - starts[i]
+            # (While impacts accumulate no step is under way: the state is the one after them.)
+            u = jnp.where(length > 0, (s - starts[i]) / jnp.where(length > 0, length, 1), 1.0)
+            return bernstein(jax.tree.map(lambda p: p[i], points), _clipped(u, 0, 1))
+
+        ys = jax.vmap(at)(jnp.ravel(_clipped(t * direction, first, last)))
+
+        def shaped(y: Array) -> Array:
+            y = y.reshape(t.shape + y.shape[1:])
+            return jnp.where(outside.reshape(t.shape + (1,) * (y.ndim - t.ndim)), jnp.nan, y)
+
+        return jax.tree.map(shaped, ys)
 
     def __call__(self, t: Any, left: bool = True) -> Y:
         return self.evaluate(t, left)

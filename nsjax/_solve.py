@@ -18,7 +18,7 @@ from ._filippov import Model, State
 from ._flow import Carry, finite, Flow
 from ._forward import forward_only
 from ._jacobian import dense_jacobian
-from ._save import Log, Saved
+from ._save import in_order, Log, Saved
 from ._solution import Events, is_okay, raise_if, RESULTS, Solution
 from ._start import start_mode
 from ._step import RungeKutta, Stepper
@@ -107,6 +107,9 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     zero = jnp.zeros((), jnp.int32)
     bad = ~finite((y0, f0, start, stop))
     result = RESULTS.where(bad, RESULTS.nonfinite_field, result)
+    if request.ts is not None and len(request.ts):
+        ordered = in_order(request.ts.astype(t0.dtype), t0, t1)
+        result = RESULTS.where(ordered, result, RESULTS.wrong_save_times)
     carry = Carry(
         t=start,
         y=y0,

@@ -129,15 +129,21 @@ class impact(AbstractSwitch):
     motion, so `vector_field` must contain it: `v' = -g + s.floor / m`. Between impacts the value `s.floor` is 0. Where
     impacts accumulate (at once if e = 0) the solution comes to rest on the surface: `s.floor` >= 0 is the force that
     keeps it there, and when it has fallen to zero the solution lifts off. (A tuple-valued h has no such state: impacts
-    that accumulate end the solution.) With `@floor.reset`, `y_after = reset(self, t, y_before)` is the user's own.
+    that accumulate end the solution.) With `@floor.reset`, `y_after = reset(self, t, y_before)` is the user's own; it
+    is run backwards in time only if `@floor.inverse`, `y_before = inverse(self, t, y_after)`, is given too.
     """
 
     reset_fn: Guard = None
+    inverse_fn: Guard = None
     restitution_fn: Callable[[Any], Any] | None = None
 
     def reset(self, fn: Guard) -> Self:
         """Decorates `reset(self, t, y) -> y_after`, of the structure of the state."""
         return self._with(reset_fn=fn)
+
+    def inverse(self, fn: Guard) -> Self:
+        """Decorates `inverse(self, t, y) -> y_before`, which undoes `reset`: for solutions backwards in time."""
+        return self._with(inverse_fn=fn)
 
     def restitution(self, fn: Callable[[Any], Any]) -> Self:
         """Decorates `e(self)`, Newton's coefficient of restitution (dimensionless, 0 <= e <= 1)."""

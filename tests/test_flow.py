@@ -142,8 +142,15 @@ class Season(nsjax.System):
         return 1.2 + 0.2 * jnp.sin(self.d * t + 0.4) - y.x
 
     @ceiling.reset
-    def ceiling(self, t, y):  # elastic, so that it is its own inverse
-        return Motion(y.x, 0.4 * jnp.cos(self.d * t + 0.4) - y.v)
+    def ceiling(self, t, y):
+        return self.rebound(t, y, 0.6**self.d)
+
+    @ceiling.inverse
+    def ceiling(self, t, y):
+        return self.rebound(t, y, 0.6**-self.d)
+
+    def rebound(self, t, y, e):
+        return Motion(y.x, (1 + e) * 0.2 * jnp.cos(self.d * t + 0.4) - e * y.v)
 
 
 def test_backwards_in_a_time_that_matters():
@@ -154,6 +161,27 @@ def test_backwards_in_a_time_that_matters():
     np.testing.assert_allclose(times(back), -times(same), atol=1e-9)
     assert itinerary(back) == itinerary(same)
     np.testing.assert_allclose(flat(back.y1), flat(same.y1), atol=1e-9)
+
+
+def test_reset_without_an_inverse_is_not_run_backwards():
+    """Issue 20.3: the state before a reset is not told by the one after it."""
+
+    class Valve(nsjax.System):
+        def vector_field(self, t, y, s):
+            return Motion(y.v, jnp.asarray(-1.0))
+
+        @nsjax.impact
+        def seat(self, t, y):
+            return y.x
+
+        @seat.reset
+        def seat(self, t, y):
+            return Motion(y.x, -0.5 * y.v)
+
+    with pytest.raises(ValueError, match="`Valve.seat` has a reset.*`@seat.inverse`"):
+        solve(Valve(), 1.0, 0.0, Motion(1.0, 0.0))
+    with pytest.raises(Exception, match="`Valve.seat` has a reset"):
+        jax.jit(lambda t1: solve(Valve(), 1.0, t1, Motion(1.0, 0.0)).y1)(0.0)
 
 
 def test_support():

@@ -149,7 +149,7 @@ def test_relay_without_off():
 
 
 def test_relay_backwards():
-    with pytest.raises(Exception, match="`Thermostat.heater` is a relay, whose memory cannot be run backwards"):
+    with pytest.raises(ValueError, match="`Thermostat.heater` is a relay, whose memory cannot be run backwards"):
         solve(Thermostat(), 1.0, 0.0, Heat(20.0))
 
 

@@ -1,0 +1,83 @@
+"""Dense output and save times (issue 20.1)."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import Motion
+
+import nsjax
+from nsjax import gallery, RESULTS
+
+
+BELT = gallery.StickSlip(v_dr=0.2, F_slip=1.0, F_stick=2.0)
+
+
+@pytest.fixture(scope="module")
+def sol():
+    return nsjax.solve(BELT, 0.0, 40.0, Motion(2.5, 0.0), saveat=dfx.SaveAt(dense=True))
+
+
+def test_arrays_of_times(sol):
+    """Pitfall 42: one state a time, as if asked for one by one; also for tables of times and for none."""
+    ts = np.array([0.0, 3.0, 17.5, 40.0])
+    one_by_one = [sol(t) for t in ts]
+    np.testing.assert_array_equal(sol(ts).x, [y.x for y in one_by_one])
+    np.testing.assert_array_equal(sol(ts.reshape(2, 2)).v, np.reshape([y.v for y in one_by_one], (2, 2)))
+    assert sol(np.zeros((0,))).x.shape == (0,)
+    event = sol.events[0].t
+    before, after = sol(jnp.stack([event, event])), sol(jnp.stack([event, event]), left=False)
+    np.testing.assert_allclose(before.x, after.x, atol=1e-12)
+
+
+def test_outside(sol):
+    """Pitfall 42: there is no state outside of the solution; times that rounding alone puts there are meant inside."""
+    with pytest.raises(ValueError, match="must lie between t0 = 0 and t1 = 40, but got 41"):
+        sol(41.0)
+    with pytest.raises(ValueError, match="but got -1 and 1 other times outside"):
+        sol([-1.0, 3.0, np.nan])
+    assert sol(np.nextafter(40.0, 50.0)) == sol(40.0)
+    ys = jax.jit(lambda sol, ts: sol(ts))(sol, jnp.asarray([-1.0, 3.0, 40.0, 41.0, jnp.nan]))
+    np.testing.assert_array_equal(np.isnan(ys.x), [True, False, False, True, True])
+
+
+def test_derivatives_at_the_ends(sol):
+    """The state moves with the time, at the ends of the solution too."""
+    for t in (0.0, 40.0):
+        np.testing.assert_allclose(jax.jacfwd(lambda t: sol(t).x)(t), sol(t).v, atol=1e-8)
+
+
+def test_batches_are_evaluated_lane_by_lane():
+    sols = jax.vmap(lambda x: nsjax.solve(BELT, 0.0, 4.0, Motion(x, 0.0 * x), saveat=dfx.SaveAt(dense=True)))(
+        jnp.asarray([2.0, 2.5])
+    )
+    with pytest.raises(ValueError, match=r"jax.vmap\(lambda sol: sol\(t\)\)"):
+        sols(1.0)
+    ts = jnp.asarray([0.0, 4.0])
+    ys = jax.vmap(lambda sol: sol(ts))(sols)
+    np.testing.assert_allclose(ys.x[:, 1], sols.y1.x, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "t1, ts, what",
+    [
+        (4.0, [3.0, 1.0], "in another order; sort them"),
+        (4.0, [-1.0, 2.0], "but got -1.0"),
+        (4.0, [1.0, 5.0], "but got 5.0"),
+        (4.0, [1.0, np.nan], "but got nan"),
+        (-4.0, [-3.0, -1.0], "in another order"),
+        (-4.0, [-1.0, 1.0], "but got 1.0"),
+    ],
+)
+def test_save_times(t1, ts, what):
+    """Pitfall 42: refused where they are known, told by status where they are traced."""
+    with pytest.raises(ValueError, match=f"`saveat` must have times `ts`.*{what}"):
+        nsjax.solve(BELT, 0.0, t1, Motion(2.5, 0.0), saveat=dfx.SaveAt(ts=jnp.asarray(ts)))
+    assert _traced(jnp.asarray(ts), t1) == RESULTS.wrong_save_times
+    assert _traced(t1 * jnp.asarray([0.0, 1.0])[: len(ts)], t1) == RESULTS.successful
+
+
+@jax.jit
+def _traced(ts, t1):
+    return nsjax.solve(BELT, 0.0, t1, Motion(2.5, 0.0), saveat=dfx.SaveAt(ts=ts), throw=False).result
