@@ -56,7 +56,13 @@ from ._solution import (
 )
 from ._solve import solve as solve
 from ._sweep import sweep as sweep
-from ._system import impact as impact, relay as relay, sgn as sgn, System as System
+from ._system import (
+    clock as clock,
+    impact as impact,
+    relay as relay,
+    sgn as sgn,
+    System as System,
+)
 from ._taylor import Taylor as Taylor
 from ._variational import fundamental_matrix as fundamental_matrix
 from ._work_precision import (

@@ -16,7 +16,7 @@ from ._exponential import Exponential
 from ._filippov import Model, State
 from ._save import in_order
 from ._structure import is_affine, is_constant
-from ._system import impact, relay, sgn, System
+from ._system import clock, impact, relay, sgn, System
 from ._types import Scalar, Y
 
 
@@ -172,6 +172,8 @@ def _given(system: System, mode: Any) -> dict[str, Any]:
             known = ", ".join(f"`{n}`" for n in switches) or "none"
             raise ValueError(f"Argument `mode` must name switches of the system, but got `{name}`; they are: {known}.")
         allowed = (-1, 0, 1) if isinstance(switches[name], sgn) else (0, 1)
+        if isinstance(switches[name], clock):
+            continue
         if isinstance(value, int) and value not in allowed:
             raise ValueError(f"Argument `mode` must give `{name}` one of {allowed}, but got {value}.")
     return {n: jnp.asarray(v, jnp.int32) for n, v in mode.items()}
@@ -208,6 +210,9 @@ def check_model(system: System, t: Scalar, y: Y, direction: Scalar) -> Scalar:
                 f"`{where or 'y'}` is {f.dtype}{list(f.shape)} where the state has {x.dtype}{list(x.shape)}."
             )
     for k, switch in enumerate(switches):
+        if isinstance(switch, clock):
+            _check_clock(name, switch, system)
+            continue
         _check_guard(name, switch.name, switch.guard, system, t, y)
         if isinstance(switch, sgn):
             _check_sgn(name, k, switch, system, field, zeros)
@@ -257,6 +262,18 @@ def _check_guard(owner: str, name: str, guard: Any, system: System, t: Scalar, y
                 f"`{owner}.{name}` must return a scalar of dtype {t.dtype} (or a tuple of them, meaning their "
                 f"minimum), but returned {got}. For many surfaces define a switch for each, or override `switches`."
             )
+
+
+def _check_clock(owner: str, switch: clock, system: System) -> None:
+    ticks = jnp.asarray(switch.guard(system))
+    if ticks.ndim > 1 or ticks.size == 0 or not jnp.issubdtype(ticks.dtype, jnp.floating):
+        raise ValueError(
+            f"`{owner}.{switch.name}` is a clock: it must return the time between two ticks, or a vector of times, but "
+            f"returned {ticks.dtype}{list(ticks.shape)}."
+        )
+    start = 0.0 if switch.offset_fn is None else switch.offset_fn(system)
+    if jnp.shape(start) != ():
+        raise ValueError(f"`{owner}.{switch.name}.offset` must return a scalar, but its shape is {jnp.shape(start)}.")
 
 
 def _check_sgn(owner: str, k: int, switch: sgn, system: System, field: Any, zeros: tuple) -> None:
@@ -317,7 +334,7 @@ def check_autonomous(system: System, t: Scalar, y: Y) -> None:
         ]
         return system.vector_field(t, y, system.values(zeros)), surfaces
 
-    if not is_constant(seen, t):
+    if any(isinstance(k, clock) for k in system.switches) or not is_constant(seen, t):
         name = type(system).__name__
         raise ValueError(
             f"`{name}` depends on the time t, but has no `period`: add a property `period`, that of its forcing, as "

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._arcs import model_of, Smooth
@@ -66,7 +67,10 @@ def cuts_of(system: System, sol: Solution, t0: Scalar, y0: Y) -> Cuts:
     model = model_of(system, t0, y0)
     events = sol.events
     index = jnp.arange(len(begin), dtype=events.num.dtype)
-    closes = (index <= events.num) & jnp.all(modes == modes[0], axis=1)
+    steady = modes
+    if model.clocks:  # which have gone on
+        steady = modes[:, np.array([k for k in range(modes.shape[1]) if k not in model.clocks], int)]
+    closes = (index <= events.num) & jnp.all(steady == steady[0], axis=1)
     num = jnp.max(jnp.where(closes, index, 0))
     last = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), events.y_before, sol.y1)
     last = where(index < events.num, last, jax.tree.map(lambda x: jnp.broadcast_to(x, (len(begin), *x.shape)), sol.y1))

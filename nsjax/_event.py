@@ -17,7 +17,7 @@ from ._settle import settle
 from ._solution import RESULTS
 from ._step import stack, Stepper
 from ._structure import is_constant
-from ._system import frozen, impact, relay, sgn
+from ._system import clock, frozen, impact, relay, sgn
 from ._types import Scalar, Y
 
 
@@ -151,9 +151,9 @@ def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> tuple[Y, Y]:
     switch = model.switches[k]
     assert isinstance(switch, impact)
     if switch.reset_fn is not None:
-        out = switch.reset_fn(model.system, t * model.direction, y)
+        out = switch.reset_fn(model.system, model.time(t), y)
         if switch.inverse_fn is not None:
-            undone = switch.inverse_fn(model.system, t * model.direction, y)
+            undone = switch.inverse_fn(model.system, model.time(t), y)
             out = jax.tree.map(lambda a, b: jnp.where(model.direction > 0, a, b), out, undone)
         return out, jax.tree.map(lambda a, b: jnp.abs(a) + jnp.abs(b), y, out)
     assert switch.restitution_fn is not None
@@ -223,6 +223,9 @@ def land(
 ) -> Landing:
     """Locates the earliest event of a step and makes the transition there."""
     found, te, before, slot, part = locate(model, stepper, t, t_next, y, f0, state, polynomials, noise)
+    ticks = jnp.asarray([k in model.clocks for k, _, _ in model.slots])[slot] if model.clocks else None
+    if ticks is not None:  # to the last digit
+        te = te + lax.stop_gradient(jnp.where(ticks, model.next_tick(state.mode) - te, 0))
     if model.holdable:
         before = model.project(te, before, state)  # what leaves a surface must do so from there, and not from beside it
     halted = te <= t
@@ -246,6 +249,8 @@ def land(
         roots[k] = jnp.where(halted, roots[k], 0)
         if isinstance(switch, relay):
             modes[k] = jnp.where(fired[k], 1 - modes[k], modes[k])
+        elif isinstance(switch, clock):
+            modes[k] = jnp.where(fired[k], modes[k] + jnp.where(model.direction > 0, 1, -1), modes[k])
         elif isinstance(switch, impact):
             touching = state._replace(part=tuple(parts))
             # Another impact at this instant may have opened it: then h < 0 is rounding.
@@ -254,6 +259,7 @@ def land(
             fired[k] = fired[k] & ~opens
             hit = rebound(model, k, te, before, touching)
             after, size = jax.tree.map(lambda a, b, now=fired[k]: jnp.where(now, a, b), hit, (after, size))
+    later = model.within(tuple(modes))  # at a tick what depends on time is another function from now on
     at = {}
     for k, switch in enumerate(model.switches):
         if isinstance(switch, sgn):
@@ -261,16 +267,25 @@ def land(
             modes[k] = jnp.where(tip[k], -1, modes[k])
             here = ((state.mode[k] == 0) | fired[k] | (halted & (roots[k] > 0))) & ~tip[k]
             roots[k] = jnp.where(tip[k], 1, roots[k])
-            if any(isinstance(other, impact) for other in model.switches):
-                # An impact may carry the state across the surface, or off it: the switch follows at once.
+            if any(isinstance(other, (impact, clock)) for other in model.switches):
+                # An impact may carry the state across the surface, or off it, and a tick the surface across the state:
+                # the switch follows at once.
                 h0 = jnp.min(jnp.stack(model.h(k, te, before)))
-                h1 = jnp.min(jnp.stack(model.h(k, te, after)))
-                slack = jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), te, after, size))
+                h1 = jnp.min(jnp.stack(later.h(k, te, after)))
+                slack = jnp.max(later.rounding(lambda t, y, k=k: later.h(k, t, y), te, after, size))
                 moved, off = jnp.abs(h1 - h0) > slack, jnp.abs(h1) > slack
                 modes[k] = jnp.where(moved & off, jnp.sign(h1).astype(jnp.int32), modes[k])
                 roots[k] = jnp.where(moved, 0, roots[k])
                 here = jnp.where(moved, ~off, here)
+                if model.clocks and parts[k] is not None:
+                    nearest = jnp.argmin(jnp.stack(later.h(k, te, after))).astype(jnp.int32)
+                    parts[k] = jnp.where(moved, nearest, parts[k])
             at[k] = here
+        elif isinstance(switch, impact) and ticks is not None:
+            gaps = jnp.stack(later.h(k, te, after))
+            slack = 1e4 * later.rounding(lambda t, y, k=k: later.h(k, t, y), te, after, size)
+            result = RESULTS.where(ticks & jnp.any(gaps < -slack), RESULTS.jump_penetrates, result)
+            modes[k] = jnp.where(ticks & jnp.all(gaps > slack), 0, modes[k])
     state_after = State(tuple(m.astype(jnp.int32) for m in modes), tuple(parts), tuple(roots))
 
     t_after, jumped = te, after
@@ -290,16 +305,16 @@ def land(
         if k in model.contacts:
             # Another impact may set a resting contact in motion: it lifts off for more than a brief flight, or is hit
             # at once.
-            level = model.level(k, te, jumped, state_after)
-            (slack,) = model.rounding(lambda t, y, k=k: (model.level(k, t, y, state_after),), te, jumped, size)
+            level = later.level(k, te, jumped, state_after)
+            (slack,) = later.rounding(lambda t, y, k=k: (later.level(k, t, y, state_after),), te, jumped, size)
             free = state_after._replace(mode=tuple(jnp.where(j == k, 0, m) for j, m in enumerate(state_after.mode)))
-            (pull,) = model.rates((k,), te, jumped, free, model.values(te, jumped, free))
+            (pull,) = later.rates((k,), te, jumped, free, later.values(te, jumped, free))
             moved = level != model.level(k, te, before, state_after)
             moved = moved & (state.mode[k] == 1) & (jnp.abs(level) > 1e3 * slack)
             moved = moved & ((level < 0) | (2 * level > -pull * brief))
             modes[k] = jnp.where(moved, 0, modes[k])
             roots[k] = jnp.where(moved, (level > 0).astype(jnp.int32), roots[k])
-            at[k] = ends | ((state.mode[k] == 1) & ~moved)
+            at[k] = ends | ((modes[k] == 1) & ~moved)
         else:
             result = RESULTS.where(ends, RESULTS.accumulation_reached, result)
     at = {k: at[k] for k in sorted(at)}
@@ -307,14 +322,14 @@ def land(
     # What cannot be held crosses when it fires, but for the residual of an event a few ulps earlier, which dh/dt tells.
     crosses = {k: fired[k] & ~(halted & (state.roots[k] == 0)) for k in fired}
     bounds = {k: b if k in model.holdable else crosses[k].astype(jnp.int32) for k, b in bounds.items()}
-    state_after, _, forked, wrong = settle(model, t_after, after, state_after, at, bounds)
+    state_after, _, forked, wrong = settle(later, t_after, after, state_after, at, bounds)
     # Run backwards, what slides or rests is what solutions that run forwards leave or join there.
     for k in model.holdable:
         entered = model.held(k, state_after.mode[k]) & ~model.held(k, state.mode[k])
         forked = forked | (entered & (model.direction < 0))
     result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
     if model.contacts:
-        after = model.project(t_after, after, state_after)
+        after = later.project(t_after, after, state_after)
 
     roots = list(state_after.roots)
     for k, switch in enumerate(model.switches):
@@ -323,9 +338,9 @@ def land(
             own = tuple(s.switch == k for s in model.slots)
 
             def guard(t: Scalar, y: Y, own: tuple[bool, ...] = own) -> list[Scalar]:
-                return model.guards(t, y, state_after, own)[own.index(True)]
+                return later.guards(t, y, state_after, own)[own.index(True)]
 
-            on_it = jnp.abs(guard(te, after)[0]) <= model.rounding(guard, te, after)[0]
+            on_it = jnp.abs(guard(te, after)[0]) <= later.rounding(guard, te, after)[0]
             roots[k] = jnp.where(fired[k], on_it.astype(jnp.int32), roots[k])
     state_after = state_after._replace(roots=tuple(roots))
     news = jnp.zeros((), bool)
@@ -334,6 +349,7 @@ def land(
         if isinstance(switch, impact):
             news = news | fired[k]
     cosine = transversality(model, te, before, state, slot, part)
+    cosine = cosine if ticks is None else jnp.where(ticks, 1, cosine)
     bends = bend([a[slot, part] for a in polynomials], (te - t) / jnp.where(halted, 1, t_next - t)) > 0
     grazes = found & news & ~halted & bends & (cosine < jnp.cbrt(jnp.finfo(te.dtype).eps))
     points = None
@@ -341,7 +357,7 @@ def land(
         # Once more, to the very event and with the derivatives of where it begins and ends.
         _, increments = _step_to(te, stepper, (model, t, y, f0, state))
         points = stack(stepper.points(y, before, increments))
-    f_after = model.flow(t_after, after, state_after)
+    f_after = later.flow(t_after, after, state_after)
     return Landing(
         found, te, t_after, before, after, f_after, state_after, slot, news, points, cosine, grazes, forked, result
     )

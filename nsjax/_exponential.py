@@ -262,7 +262,7 @@ class ExponentialStepper(Stepper):
         guards: list[list[list[Scalar]]] = []
         noise: list[list[Scalar]] = []
         resolved = jnp.ones((), bool)
-        for row, others, known, affine in zip(batch, near, model.known_roots(state), watch.affine):
+        for slot, row, others, known, affine in zip(model.slots, batch, near, model.known_roots(state), watch.affine):
             guards.append([list(jnp.asarray(matrix, t.dtype) @ values) for values in row])
             noise.append([jnp.abs(other - values[0]) for other, values in zip(others, row)])
             for values, slack, roots in zip(row, noise[-1], known):
@@ -275,7 +275,8 @@ class ExponentialStepper(Stepper):
                 sag = [jnp.abs(a - 2 * b + c) / 8 for a, b, c in zip(dense, dense[1:], dense[2:])]  # between points
                 dips = [b - s for b, s in zip(dense, [sag[0], *sag, sag[-1]])]
                 touches = (ft.reduce(jnp.minimum, dips) <= error) & (ft.reduce(jnp.minimum, dense) > -error)
-                resolved = resolved & ~(touches & (roots == 0) & (size > slack))
+                if slot.switch not in model.clocks:  # which have no near misses
+                    resolved = resolved & ~(touches & (roots == 0) & (size > slack))
         resolved = once(jnp.where(resolved, 1.0, 0.0)) > 0
         return step._replace(guards=guards, noise=lax.stop_gradient(with_multipliers(model, noise)), resolved=resolved)
 

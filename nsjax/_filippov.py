@@ -6,6 +6,7 @@ being held on m surfaces at once solves m equations for the m multipliers, n_i .
 (2.19)-(2.20), and d²h_i/dt² = 0 for contact, whose multiplier is the contact force.
 """
 
+import functools as ft
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._linear import linear_solve
 from ._structure import is_affine, is_constant
-from ._system import AbstractSwitch, impact, relay, sgn, System
+from ._system import AbstractSwitch, clock, frozen, impact, relay, sgn, System
 from ._types import Mode, Scalar, Y
 
 
@@ -58,14 +59,18 @@ class Model(eqx.Module):
     parts: tuple[int, ...] = eqx.field(static=True)  # number of components of h, per switch
     holdable: tuple[int, ...] = eqx.field(static=True)  # switches whose value can hold the solution on their surface
     contacts: tuple[int, ...] = eqx.field(static=True)  # the impacts among them
+    clocks: tuple[int, ...] = eqx.field(static=True)  # switches that tick
     jointly_affine: bool = eqx.field(static=True)
     slots: tuple[Slot, ...] = eqx.field(static=True)
+    window: tuple[Scalar, Scalar] | None  # the ticks between which time is kept
 
     def __init__(self, system: System, direction: Any, t: Scalar, y: Y):
         self.system = system
         self.direction = direction
+        self.window = None
         self.switches = system.switches
         self.parts = tuple(len(k.components(system, t, y)) for k in self.switches)
+        self.clocks = tuple(k for k, switch in enumerate(self.switches) if isinstance(switch, clock))
         zeros = tuple(jnp.zeros((), jnp.result_type(t)) for _ in self.switches)
         one = jnp.ones_like(t)
 
@@ -96,14 +101,69 @@ class Model(eqx.Module):
                 slots += [Slot(k, sign, True) for sign in ((1,) if k in self.contacts else (1, -1))]
         self.slots = tuple(slots)
 
+    # Time, which is kept between the ticks of the clocks: at a tick a function of it is taken from the side of its mode.
+
+    def within(self, mode: Mode) -> "Model":
+        """The same for a mode, that tells between which ticks it is."""
+        if not self.clocks:
+            return self
+        spans = [self.span(k, mode) for k in self.clocks]
+        low, high = (ft.reduce(pick, ends) for pick, ends in zip((jnp.maximum, jnp.minimum), zip(*spans)))
+        return eqx.tree_at(lambda m: m.window, self, frozen((low, high)), is_leaf=lambda x: x is None or x is self.window)
+
+    def at(self, t: Scalar) -> "Model":
+        """The same for what sets out at time `t`."""
+        zero, counts = jnp.zeros((), jnp.int32), self.counts(t)
+        return self.within(tuple(counts.get(k, zero) for k in range(len(self.switches))))
+
+    def _in(self, state: State) -> "Model":
+        return self if self.window is not None else self.within(state.mode)
+
+    def span(self, k: int, mode: Mode) -> tuple[Scalar, Scalar]:
+        """The last and the next tick of clock k, in the time of the user."""
+        switch = self.switches[k]
+        assert isinstance(switch, clock)
+        return switch.span(self.system, mode[k], jnp.ones((), jnp.result_type(self.direction)))
+
+    def counts(self, t: Scalar) -> dict[int, Int[Array, ""]]:
+        """How often each clock has ticked."""
+        passed = {}
+        for k in self.clocks:
+            switch = self.switches[k]
+            assert isinstance(switch, clock)
+            passed[k] = switch.count(self.system, frozen(t * self.direction), self.direction > 0)
+        return passed
+
+    def next_tick(self, mode: Mode) -> Scalar:
+        """When time, increasing as the flow sees it, meets the next tick."""
+        ends = [self.span(k, mode) for k in self.clocks]
+        return ft.reduce(jnp.minimum, [jnp.where(self.direction > 0, high, -low) for low, high in ends])
+
+    def time(self, t: Scalar) -> Scalar:
+        """The time of the user, kept between the ticks of the mode.
+
+        As near to a tick as rounding takes it (and `t % T` or `floor(t / T)` with it) it is put on the right side;
+        beyond, where only a search that has not converged yet goes, it stands still. (By comparisons: to a power series
+        in t a shift is a number, but a maximum of t and the tick is the one or the other.)
+        """
+        t = t * self.direction
+        if self.window is None:
+            return t
+        low, high = self.window
+        size = ft.reduce(jnp.maximum, [jnp.where(jnp.isfinite(x), jnp.abs(x), 0) for x in (low, high, frozen(t))])
+        margin = 100 * float(jnp.finfo(t.dtype).eps) * size + float(jnp.finfo(t.dtype).tiny) ** 0.75
+        shift = jnp.where(t < low + margin, 2 * margin, 0) - jnp.where(t > high - margin, 2 * margin, 0)
+        kept = jnp.where(t < low - margin, low + margin, t + shift)
+        return jnp.where(t > high + margin, high - margin, kept)
+
     # The smooth field for given switch values, and the indicator functions.
 
     def field(self, t: Scalar, y: Y, s: tuple[Any, ...]) -> Y:
-        f = self.system.vector_field(t * self.direction, y, self.system.values(s))
+        f = self.system.vector_field(self.time(t), y, self.system.values(s))
         return jax.tree.map(lambda x: x * self.direction, f)
 
     def h(self, k: int, t: Scalar, y: Y) -> tuple[Scalar, ...]:
-        return self.switches[k].components(self.system, t * self.direction, y)
+        return self.switches[k].components(self.system, self.time(t), y)
 
     def bound(self, k: int) -> Any:
         switch = self.switches[k]
@@ -137,6 +197,7 @@ class Model(eqx.Module):
 
     def level(self, k: int, t: Scalar, y: Y, state: State) -> Scalar:
         """What its multiplier keeps at zero: the active component of h; for a contact dh/dt, as forces act on that."""
+        self = self._in(state)
 
         def h(t: Scalar, y: Y) -> Scalar:
             return _pick(self.h(k, t, y), state.part[k])
@@ -148,6 +209,7 @@ class Model(eqx.Module):
 
     def rates(self, which: tuple[int, ...], t: Scalar, y: Y, state: State, s: tuple) -> tuple[Scalar, ...]:
         """The rates of change of `level` for each switch in `which`, for switch values `s`."""
+        self = self._in(state)
 
         def levels(t: Scalar, y: Y) -> tuple[Scalar, ...]:
             return tuple(self.level(k, t, y, state) for k in which)
@@ -156,6 +218,7 @@ class Model(eqx.Module):
 
     def approach(self, k: int, t: Scalar, y: Y, state: State) -> Scalar:
         """dh/dt of switch k along the flow (the active component of h)."""
+        self = self._in(state)
         f = self.flow(t, y, state)
         return jax.jvp(lambda t, y: _pick(self.h(k, t, y), state.part[k]), (t, y), (jnp.ones_like(t), f))[1]
 
@@ -168,6 +231,7 @@ class Model(eqx.Module):
 
     def linear(self, t: Scalar, y: Y, state: State, s: tuple) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
         """Rates of the holdable surfaces at `s`, and their derivatives with respect to the holdable values."""
+        self = self._in(state)
         which = self.holdable
 
         def rates(sigma: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -188,6 +252,7 @@ class Model(eqx.Module):
 
     def values(self, t: Scalar, y: Y, state: State) -> tuple[Any, ...]:
         """The value of every switch in a mode: signs, and the multipliers λ of those that are held, (2.20)."""
+        self = self._in(state)
         s = self.signs(t, state)
         which = self.holdable
         if not which:
@@ -227,6 +292,7 @@ class Model(eqx.Module):
 
     def flow(self, t: Scalar, y: Y, state: State) -> Y:
         """The right-hand side in a mode; for a sliding one it is Filippov's field (2.19)."""
+        self = self._in(state)
         return self.field(t, y, self.values(t, y, state))
 
     def project(self, t: Scalar, y: Y, state: State) -> Y:
@@ -239,6 +305,7 @@ class Model(eqx.Module):
         which = self.holdable
         if not which:
             return y
+        self = self._in(state)
         s = self.values(t, y, state)
         held = jnp.stack([self.held(k, state.mode[k]) for k in which])
         _, slope = self.linear(t, y, state, s)
@@ -271,6 +338,7 @@ class Model(eqx.Module):
     ) -> list[list[Scalar]]:
         """`guards[slot][part]` (of the slots that are `wanted`, else empty), as scalars: stacked arrays of two or
         five cost XLA's CPU code several times as much. `s`: the values of the switches, if they are known."""
+        self = self._in(state)
         one = jnp.ones((), t.dtype)
         wanted = (True,) * len(self.slots) if wanted is None else wanted
         if s is None:
@@ -287,9 +355,14 @@ class Model(eqx.Module):
                     left = jnp.where(state.roots[k] * slot.part <= -BEYOND, -slot.part * s[k] - 1, left)
                 row = [jnp.where(self.held(k, mode), left, one)]
             elif isinstance(switch, relay):
-                on = switch.guard(self.system, t * self.direction, y)
-                off = switch.off_guard(self.system, t * self.direction, y)
+                on = switch.guard(self.system, self.time(t), y)
+                off = switch.off_guard(self.system, self.time(t), y)
                 row = [-jnp.where(mode == 1, off, on)]
+            elif isinstance(switch, clock):
+                low, high = self.span(k, state.mode)
+                left = jnp.where(self.direction > 0, high - t * self.direction, t * self.direction - low)
+                there = jnp.isfinite(jnp.where(self.direction > 0, high, low))
+                row = [jnp.where(there, left, one)]
             elif isinstance(switch, impact):
                 gap = self.h(k, t, y)[slot.part]
                 row = [jnp.where(mode == 1, one, gap) if k in self.contacts else gap]

@@ -16,7 +16,7 @@ from ._filippov import Model
 from ._orbit import ravel
 from ._solution import raise_if, RESULTS
 from ._structure import is_constant
-from ._system import arrays_of, impact, sgn, System
+from ._system import arrays_of, clock, impact, sgn, System
 from ._types import Y
 
 
@@ -113,8 +113,8 @@ def checked_equilibrium(system: System, y0: Y, t: Any, mode: Any, tol: float | N
     y0, t, _, _, _, given = check_solve(system, t, t, y0, mode, dfx.Dopri8(), None, dfx.SaveAt(t1=True), 1, 1, None)
     system = arrays_of(system, t.dtype)
     values = system.values(tuple(jnp.zeros((), t.dtype) for _ in system.switches))
-    constant = is_constant(lambda t: system.vector_field(t, y0, values), t)
-    if not constant:
+    ticks = any(isinstance(switch, clock) for switch in system.switches)
+    if ticks or not is_constant(lambda t: system.vector_field(t, y0, values), t):
         raise ValueError(
             f"`{type(system).__name__}` has no equilibrium, as time enters its vector field: look for a periodic orbit "
             "by `find_orbit`, or leave the forcing out of the model."

@@ -7,7 +7,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from ._system import impact, relay, System
+from ._system import impact, sgn, System
 
 
 LAPS = 8  # of orthogonal iteration: multipliers farther apart than a factor of forty are told apart to all digits
@@ -18,7 +18,7 @@ def structural_zeros(system: System, modes: Int[Array, "arcs switches"]) -> Int[
     perturbations, each contact that rests two, and what is lost on one arc of the orbit is lost for all."""
     lost = jnp.zeros(len(modes), jnp.int32)
     for k, switch in enumerate(system.switches):
-        if not isinstance(switch, relay):
+        if isinstance(switch, (impact, sgn)):
             held = (
                 jnp.where(modes[:, k] == 1, 2, 0) if isinstance(switch, impact) else jnp.where(modes[:, k] == 0, 1, 0)
             )

@@ -75,19 +75,24 @@ class Flow(eqx.Module):
     want_points: bool = eqx.field(static=True)
     meter: dfx.AbstractProgressMeter
     affine: tuple[bool, ...] = eqx.field(static=True)  # whether each guard is affine in (t, y)
+    jumpy: tuple[bool, ...] = eqx.field(static=True)  # whether each guard holds an operation that may jump
     reverse: bool = eqx.field(static=True)  # whether the loop is to be transposed
 
     def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list, noise: list) -> Landing:
         """The step once more, to its first event."""
-        polynomials = once(self.stepper.scaled(self.model, lax.stop_gradient(coefficients)))
-        noises = self.model.stacked(lax.stop_gradient(noise), 0.0)
-        return land(self.model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials, noises)
+        model = self.model.within(state.mode)
+        polynomials = once(self.stepper.scaled(model, lax.stop_gradient(coefficients)))
+        noises = model.stacked(lax.stop_gradient(noise), 0.0)
+        return land(model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials, noises)
 
     def attempt(self, c: Carry) -> _Attempt:
         """A step of the solver, its error against the tolerance, and whether a guard may have a root on it."""
-        model, stepper = self.model, self.stepper
+        model, stepper = self.model.within(c.state.mode), self.stepper
 
         t_next = jnp.where(c.t + c.dt >= self.t1, self.t1, c.t + c.dt)
+        tick = model.next_tick(c.state.mode) if model.clocks else jnp.inf
+        if model.clocks:
+            t_next = jnp.minimum(t_next, jnp.maximum(tick, c.t))
         step = stepper(model, c.state, c.t, t_next, c.y, c.f, Watch(self.affine, self.controller))
         t_next = step.t_next
         keep, dt, controller, outcome = self.pace(c, step)
@@ -106,12 +111,20 @@ class Flow(eqx.Module):
             eps = float(jnp.finfo(c.t.dtype).eps)
             floor = 4 * eps / unresolved(c.t.dtype) * jnp.maximum(jnp.abs(c.t), self.t1 - self.t0)
             poor = ~step.resolved | _backward(step, known)
-            poor = poor & keep & is_finite & (halvings < 30) & (t_next - c.t > floor)
+            poor, last = poor & keep & is_finite, (halvings >= 30) | (t_next - c.t <= floor)
+            if any(self.jumpy):
+                result = RESULTS.where(poor & last & self.leaps(model, c, step), RESULTS.jump_in_time, result)
+            poor = poor & ~last
             halvings = jnp.where(poor, halvings + 1, jnp.where(keep, 0, halvings))
             keep = keep & ~poor
             dt = jnp.where(poor, 0.5 * (t_next - c.t), dt)
             # On the last few ulps before the end the polynomials are rounding.
-            busy = c.active & keep & is_finite & ~quiet & (t_next - c.t > 4 * eps * jnp.abs(c.t))
+            ahead = t_next - c.t > 4 * eps * jnp.abs(c.t)
+            if model.clocks:
+                ahead = ahead | (t_next >= tick)
+                # A step cut short by a tick says nothing against a longer one.
+                dt = jnp.where(keep & (t_next >= tick), jnp.maximum(dt, c.dt), dt)
+            busy = c.active & keep & is_finite & ~quiet & ahead
         if self.reverse:
             # The derivatives of a rejected step that overflows are no numbers, and zero times that is none either.
             again = stepper(model, c.state, c.t, jnp.where(keep, t_next, c.t), c.y, c.f)
@@ -120,7 +133,7 @@ class Flow(eqx.Module):
 
     def pace(self, c: Carry, step: Step) -> tuple[Any, Any, PyTree, Any]:
         """Whether a step is accurate enough, the length of the next, and the controller's state and verdict."""
-        model, t, t_next = self.model, *frozen((c.t, step.t_next))
+        model, t, t_next = self.model.within(c.state.mode), *frozen((c.t, step.t_next))
         own = self.stepper.pace(self.controller, frozen(step), t, frozen(c.y), self.t1 - self.t0)
         if own is not None:
             return *own, c.controller, dfx.RESULTS.successful
@@ -137,6 +150,23 @@ class Flow(eqx.Module):
         )
         return keep, b - a, controller, outcome
 
+    def leaps(self, model: Model, c: Carry, step: Step) -> Bool[Array, ""]:
+        """Whether a guard that no step is short enough to resolve jumps: changes by far more than its derivatives at
+        both ends of the step make it, and rounding. (One with a kink does not.)"""
+        change = jax.tree.map(lambda a, b, f: jnp.abs(b - a) + jnp.abs(f * (step.t_next - c.t)), c.y, step.y1, c.f)
+        found = jnp.zeros((), bool)
+        for i in [i for i, jumps in enumerate(self.jumpy) if jumps]:
+            wanted = tuple(j == i for j in range(len(self.jumpy)))
+
+            def guard(t: Scalar, y: Y, i: int = i, wanted: tuple[bool, ...] = wanted) -> list[Scalar]:
+                return model.guards(t, y, c.state, wanted)[i]
+
+            ends = [(c.t, c.y), (step.t_next, step.y1)]
+            before, after = (jnp.stack(guard(*end)) for end in ends)
+            smooth = [model.sizes(guard, *end, step.t_next - c.t, change) + model.rounding(guard, *end) for end in ends]
+            found = found | jnp.any(jnp.abs(after - before) > 1e3 * (smooth[0] + smooth[1]))
+        return lax.stop_gradient(found)
+
     def survey(self, guards: list, known: list) -> Scalar:
         """A lower bound of the guards along the step, leaving out their known roots; not a number if any coefficient is
         not finite. Where it is positive no guard has a root: one of its parts is positive all along."""
@@ -145,7 +175,7 @@ class Flow(eqx.Module):
 
     def arrive(self, c: Carry, attempt: _Attempt) -> Landing:
         """Where the step leads: to its end, or to the first event on it."""
-        model = self.model
+        model = self.model.within(c.state.mode)
         step = attempt.step
         t, no = step.t_next, jnp.zeros((), bool)
         y_end = model.project(t, step.y1, c.state)

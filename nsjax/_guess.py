@@ -15,7 +15,7 @@ from ._orbit import distance, ravel
 from ._saltation import states
 from ._solution import is_okay, RESULTS
 from ._solve import solve
-from ._system import relay, sgn, System
+from ._system import clock, relay, sgn, System
 from ._types import Scalar, Y
 from ._variational import arcs
 
@@ -61,6 +61,8 @@ def at_start(model: Model, t: Scalar, y: Y) -> Any:
             zero = jnp.where(jnp.abs(h) <= 1e3 * noise, 0, jnp.sign(h)).astype(jnp.int32)
         elif isinstance(switch, relay):
             zero = (switch.guard(model.system, t, y) > 0).astype(jnp.int32)
+        elif isinstance(switch, clock):
+            zero = model.counts(t)[k]
         modes.append(zero)
     return states(model, t, y, tuple(modes))
 

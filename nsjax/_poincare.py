@@ -22,7 +22,7 @@ from ._filippov import Model, State
 from ._solution import is_okay, raise_if, RESULTS
 from ._solve import solve
 from ._start import AT_ONCE, start_mode
-from ._system import AbstractSwitch, arrays_of, forwarded, frozen, impact, relay, sgn, SwitchValues, System
+from ._system import AbstractSwitch, arrays_of, clock, forwarded, frozen, impact, relay, sgn, SwitchValues, System
 from ._types import Scalar, Y
 
 
@@ -269,6 +269,11 @@ def section_map(
             raise ValueError(
                 f"Argument `section` must be a function of (t, y), or the name of a switch of `{owner}` ({known}), but "
                 f"got {section!r}."
+            )
+        if isinstance(found, clock):
+            raise ValueError(
+                f"Argument `section` must not be the clock `{section}`, which ticks by itself: take "
+                "`nsjax.stroboscopic_map`."
             )
         if isinstance(found, impact) and direction == -1:
             raise ValueError(

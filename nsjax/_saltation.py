@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from ._event import completed, rebound
 from ._filippov import Model, State
 from ._solution import Events
-from ._system import arrays_of, impact, relay, System
+from ._system import arrays_of, clock, impact, relay, System
 from ._types import Scalar, Y
 
 
@@ -54,6 +54,8 @@ def fired(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
         on = switch.guard(model.system, t, y)
         assert switch.off_guard is not None
         return jnp.where(mode == 1, switch.off_guard(model.system, t, y), on)
+    if isinstance(switch, clock):
+        return model.span(k, state.mode)[1] - t
     h = model.h(k, t, y)
     surface = h[0] if len(h) == 1 else jnp.stack(h)[state.part[k]]
     if k not in model.holdable:
@@ -69,6 +71,8 @@ def landed(model: Model, k: int, t: Scalar, y: Y, state: State, after: tuple) ->
     if not isinstance(model.switches[k], impact):
         return y, none
     bounced, _ = rebound(model, k, t, y, state)
+    # (Between two ticks: a segment that follows may be the first of the next period.)
+    after = tuple(state.mode[j] if j in model.clocks else m for j, m in enumerate(after))
     free = jnp.zeros_like(after[k])
     flight = states(model, t, bounced, after[:k] + (free,) + after[k + 1 :])
     end = completed(model, k, t, y, bounced, state, flight)

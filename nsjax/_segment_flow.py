@@ -53,6 +53,7 @@ class SegmentFlow(eqx.Module):
     def field(self, t: Scalar, x: Array, value: Array, state: State) -> Array:
         model = with_parameter(self.model, self.path, value)
         if self.exact and not self.slides:
+            model = model.within(state.mode)
             return jfu.ravel_pytree(model.field(t, self.unravel(x), model.signs(t, state)))[0]
         return jfu.ravel_pytree(model.flow(t, self.unravel(x), state))[0]
 

@@ -22,7 +22,7 @@ from ._save import in_order, Log, Saved
 from ._solution import Events, is_okay, raise_if, RESULTS, Solution
 from ._start import start_mode
 from ._step import RungeKutta, Stepper
-from ._structure import is_affine
+from ._structure import is_affine, may_jump
 from ._system import arrays_of, frozen, System
 from ._taylor import Taylor, TaylorStepper
 from ._types import Scalar, Y
@@ -66,7 +66,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     direction = jnp.where(t1 >= t0, 1, -1).astype(t0.dtype)
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
-    model = Model(system, direction, start, y0)
+    model = Model(system, direction, start, y0).at(start)
     start = check_contacts(model, start, y0)
     max_events = max_events if model.slots else 0
     state, forked, result = start_mode(model, start, y0, given, frozen(stop - start))
@@ -80,6 +80,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         return model.guards(*ty, state, wanted=tuple(j == i for j in slots))[i]
 
     affine = tuple(is_affine(ft.partial(guard, i), (start, y0)) for i in slots)
+    jumpy = tuple(not affine[i] and may_jump(ft.partial(guard, i), (start, y0)) for i in slots)
     terms = dfx.ODETerm(lambda t, y, args: model.flow(t, y, state))
     func: Any = solver.func
     first, controller_state = controller.init(terms, start, stop, y0, dt0, None, func, solver.error_order(terms))
@@ -102,6 +103,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         want_points=saveat.dense or request.ts is not None,
         meter=meter,
         affine=affine,
+        jumpy=jumpy,
         reverse=reverse,
     )
     zero = jnp.zeros((), jnp.int32)

@@ -23,11 +23,17 @@ def start_mode(
     modes, parts, roots, at = [], [], [], {}
     result = RESULTS.successful
     on, beyond = {}, {}
+    counts = model.counts(t)
     for k, switch in enumerate(model.switches):
         zero = jnp.zeros((), jnp.int32)
+        if k in counts:  # whatever `mode` says: it may be that of the same phase a period earlier
+            modes.append(counts[k])
+            parts.append(None)
+            roots.append(zero)
+            continue
         if isinstance(switch, relay):
-            up = switch.guard(model.system, t * model.direction, y) > 0
-            down = switch.off_guard(model.system, t * model.direction, y) > 0
+            up = switch.guard(model.system, model.time(t), y) > 0
+            down = switch.off_guard(model.system, model.time(t), y) > 0
             held = jnp.asarray(given.get(switch.name, 0), jnp.int32)
             modes.append(jnp.where(up & ~down, 1, jnp.where(down, 0, held)).astype(jnp.int32))
             parts.append(None)

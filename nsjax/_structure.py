@@ -19,6 +19,8 @@ _ELEMENTWISE = frozenset(
     "max min mul ne neg nextafter not or pow real_type reduce_precision rem round rsqrt select_n sign sin sinh sqrt "
     "square stop_gradient sub tan tanh xor".split()
 )
+# They jump, or tell others where to. (What only looks whether a number is finite does not count.)
+_JUMPING = frozenset("ceil eq floor ge gt le lt ne nextafter rem round sign".split())
 # Entries are moved, repeated or summed: what that makes of a mask (parameters `p` of the primitive, operands `m`).
 _MOVING: dict[str, Callable[..., np.ndarray]] = {
     "broadcast_in_dim": lambda p, m: np.broadcast_to(
@@ -35,8 +37,10 @@ _MOVING: dict[str, Callable[..., np.ndarray]] = {
 }
 
 
-def _masks(jaxpr: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Which entries of the results depend on the marked entries of the inputs; too many rather than too few."""
+def _masks(jaxpr: Any, inputs: list[np.ndarray], jumps: list[str] | None = None) -> list[np.ndarray]:
+    """Which entries of the results depend on the marked entries of the inputs; too many rather than too few. `jumps`
+    gathers the operations that jump and are applied to such entries."""
+    jumps = [] if jumps is None else jumps
     known = dict(zip(jaxpr.invars, inputs))
 
     def shape(v: Any) -> tuple[int, ...]:
@@ -47,6 +51,8 @@ def _masks(jaxpr: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
 
     for e in jaxpr.eqns:
         have, name = [read(v) for v in e.invars], e.primitive.name
+        if name in _JUMPING and any(m.any() for m in have):
+            jumps.append(name)
         inner = [p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr)]
         if not any(m.any() for m in have):
             out = [np.zeros(shape(v), bool) for v in e.outvars]
@@ -58,7 +64,7 @@ def _masks(jaxpr: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
             left, right = (m.any(tuple(axes)) for m, axes in zip(have, e.params["dimension_numbers"][0]))
             out = [np.logical_or.outer(left, right)]
         elif name in ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call") and len(inner) == 1:
-            out = _masks(inner[0].jaxpr, have)
+            out = _masks(inner[0].jaxpr, have, jumps)
         else:
             out = [np.ones(shape(v), bool) for v in e.outvars]
         known.update(zip(e.outvars, out))
@@ -72,6 +78,15 @@ def is_constant(fn: Callable[[Any], Any], x: Any) -> bool:
 
 
 def is_affine(fn: Callable[[Any], Any], x: Any) -> bool:
-    """Whether `fn` is structurally affine in `x`: its derivative does not depend on where it is taken."""
+    """Whether `fn` is structurally affine in `x`: its derivative does not depend on where it is taken, and it does not
+    jump (the derivative of a staircase is constant too)."""
     dx = jax.tree.map(jnp.ones_like, x)
-    return is_constant(lambda x: jax.jvp(fn, (x,), (dx,))[1], x)
+    return not may_jump(fn, x) and is_constant(lambda x: jax.jvp(fn, (x,), (dx,))[1], x)
+
+
+def may_jump(fn: Callable[[Any], Any], x: Any) -> bool:
+    """Whether `fn` holds an operation that jumps, of a number that depends on `x`."""
+    jaxpr = jax.make_jaxpr(fn)(x).jaxpr
+    met: list[str] = []
+    _masks(jaxpr, [np.ones(v.aval.shape, bool) for v in jaxpr.invars], met)
+    return bool(met)

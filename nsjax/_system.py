@@ -15,7 +15,7 @@ from typing import Any, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ._types import Guard, Scalar, Y
 
@@ -148,6 +148,64 @@ class impact(AbstractSwitch):
     def restitution(self, fn: Callable[[Any], Any]) -> Self:
         """Decorates `e(self)`, Newton's coefficient of restitution (dimensionless, 0 <= e <= 1)."""
         return self._with(restitution_fn=fn)
+
+
+class clock(AbstractSwitch):
+    """The times at which functions of time in the model jump: a carrier, a square wave, a table of set points.
+
+    ```python
+    @nsjax.clock                       # ticks at 0, T, 2T, ...: where t % T falls back to zero
+    def carrier(self):
+        return self.T
+
+    @nsjax.sgn
+    def comparator(self, t, y):
+        return y.v - self.V_low - self.slope * (t % self.T)
+    ```
+
+    Time is a function like any other in `vector_field`, guards and resets, and may be put into `%`, `jnp.floor`,
+    `jnp.where` or a table, if the instants at which this jumps (or has a kink) are ticks of a clock. They are met
+    exactly: a step ends there, the model is taken from before the tick and from after it, and the modes of all switches
+    are decided anew. Derivatives by the times of the ticks are those of the flow.
+
+    Its mode is the number of ticks that have passed, counted from time 0 (or from the first of a list), and so is its
+    value in `vector_field`.
+
+    **Arguments:**
+
+    - `guard`: the method `ticks(self)`, which returns the time T > 0 between two ticks, or a vector of increasing
+        times, which are all ticks there are [time].
+    - `name`: needed only when the switch is made outside a class body.
+    """
+
+    offset_fn: Callable[[Any], Any] | None = None
+
+    def offset(self, fn: Callable[[Any], Any]) -> Self:
+        """Decorates `t_0(self)`: the ticks are at t_0 + n T [time]."""
+        return self._with(offset_fn=fn)
+
+    def components(self, system: "System", t: Scalar, y: Y) -> tuple[Scalar, ...]:
+        return (jnp.zeros_like(t),)  # it has no surface
+
+    def _times(self, system: "System", like: Scalar) -> tuple[Array, Scalar]:
+        start = 0.0 if self.offset_fn is None else self.offset_fn(system)
+        return jnp.asarray(self.guard(system), like.dtype), jnp.asarray(start, like.dtype)
+
+    def span(self, system: "System", count: Int[Array, ""], like: Scalar) -> tuple[Scalar, Scalar]:
+        """The last tick and the next one, when `count` have passed; infinite where there is none."""
+        times, start = self._times(system, like)
+        if times.ndim == 0:
+            return start + count.astype(like.dtype) * times, start + (count + 1).astype(like.dtype) * times
+        ends = jnp.concatenate([jnp.asarray([-jnp.inf], like.dtype), start + times, jnp.asarray([jnp.inf], like.dtype)])
+        return ends[count], ends[count + 1]
+
+    def count(self, system: "System", t: Scalar, forwards: Any) -> Int[Array, ""]:
+        """How many ticks have passed at time `t`; at a tick those after it, or before it if time runs backwards."""
+        times, start = self._times(system, t)
+        blur = 8 * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + jnp.abs(start)) * jnp.where(forwards, 1, -1)
+        if times.ndim == 0:
+            return jnp.floor((t - start + blur) / times).astype(jnp.int32)
+        return jnp.searchsorted(start + times, t + blur, side="right").astype(jnp.int32)
 
 
 @ft.cache  # switches are told apart by identity

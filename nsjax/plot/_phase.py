@@ -10,7 +10,7 @@ import numpy as np
 from .._orbit import Orbit
 from .._solution import Solution
 from .._structure import is_constant
-from .._system import AbstractSwitch, impact, relay, sgn
+from .._system import AbstractSwitch, clock, impact, relay, sgn
 from .._types import Y
 from ._path import arcs, chosen, components, solved
 from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_legend, mode_line
@@ -109,6 +109,8 @@ def _draw_surfaces(ax: "Axes", sol: Solution, x: str, y: str) -> None:
 
 def _guards(switch: AbstractSwitch) -> list[tuple[Any, str]]:
     """Indicator functions with the line style of their surfaces: where a relay switches on, and off."""
+    if isinstance(switch, clock):
+        return []
     if isinstance(switch, relay):
         return [(switch.guard, "--"), (switch.off_guard, ":")]
     return [(lambda *args: jnp.stack(switch.components(*args)).min(), "--")]

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, TYPE_CHECKING
 
-from .._system import impact, relay, System
+from .._system import clock, impact, relay, System
 
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ def mode_line(system: System, mode: tuple[int, ...]) -> dict[str, Any]:
             words += [f"{switch.name}: rests"] * (value != 0)
         elif isinstance(switch, relay):
             words.append(f"{switch.name} {'on' if value else 'off'}")
+        elif isinstance(switch, clock):
+            value = 0  # each tick another mode: no line for each
         else:
             words.append(f"{switch.name} {('= 0, slides', '> 0', '< 0')[value]}")
             slides |= value == 0

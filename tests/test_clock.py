@@ -1,0 +1,273 @@
+"""Functions of time that jump (issue 20.2; pitfalls 12 and 36): ticks of a clock are met exactly, and what is not
+declared is found."""
+
+from typing import NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array
+from models import flat, Motion, pid
+from scipy.linalg import expm
+from scipy.optimize import brentq
+
+import nsjax
+from nsjax import RESULTS
+
+
+class Charge(NamedTuple):
+    v: Array  # [V]
+    i: Array  # [A]
+
+
+class Buck(nsjax.System):
+    """A voltage-controlled buck converter with the values of Hamill and Deane (1992): the switch conducts while the
+    control voltage lies below a sawtooth."""
+
+    R: float = 22.0
+    L: float = 20e-3
+    C: float = 47e-6
+    V_in: float = 22.0
+    V_ref: float = 11.3
+    gain: float = 8.4
+    V_low: float = 3.8
+    V_high: float = 8.2
+    T: float = 400e-6
+
+    def vector_field(self, t, y, s):
+        conducts = 0.5 * (1 - s.comparator)
+        return Charge((y.i - y.v / self.R) / self.C, (self.V_in * conducts - y.v) / self.L)
+
+    @nsjax.clock
+    def carrier(self):
+        return self.T
+
+    @nsjax.sgn
+    def comparator(self, t, y):
+        ramp = self.V_low + (self.V_high - self.V_low) * (t / self.T % 1.0)
+        return self.gain * (y.v - self.V_ref) - ramp
+
+    @property
+    def period(self):
+        return self.T
+
+
+class Undeclared(Buck):
+    """The same, without a word of its carrier."""
+
+    carrier = None
+
+
+def buck(y0: np.ndarray, periods: int) -> tuple[list[float], np.ndarray]:
+    """Times of the comparator's changes within the periods, and the state at the end, by matrix exponentials."""
+    p = Buck()
+    m = np.array([[-1 / (p.R * p.C), 1 / p.C, 0], [-1 / p.L, 0, 0], [0, 0, 0]])
+    on = m.copy()
+    on[1, 2] = p.V_in / p.L
+    z, times = np.append(y0, 1.0), []
+    for n in range(periods):
+
+        def h(t, z, n=n):
+            return p.gain * (z[0] - p.V_ref) - p.V_low - (p.V_high - p.V_low) * (t / p.T - n)
+
+        t = n * p.T
+        conducts = h(t, z) < 0
+        while True:
+            a = on if conducts else m
+            # The signal is slow against its ramp: a hundred samples of a period hide no change.
+            ts = np.linspace(t, (n + 1) * p.T, 101)
+            hs = [h(s, expm(a * (s - t)) @ z) for s in ts]
+            hs[0] = -1.0 if conducts else 1.0
+            change = next((i for i in range(100) if (hs[i + 1] < 0) != conducts), None)
+            if change is None:
+                z = expm(a * (ts[-1] - t)) @ z
+                break
+            e = brentq(lambda s: h(s, expm(a * (s - t)) @ z), ts[change] + 1e-15, ts[change + 1], xtol=1e-18, rtol=1e-15)
+            z, t, conducts = expm(a * (e - t)) @ z, e, not conducts
+            times.append(e)
+    return times, z[:2]
+
+
+SOLVERS = {"Tsit5": dfx.Tsit5(), "Taylor": nsjax.Taylor(), "Exponential": nsjax.Exponential()}
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_buck_converter(solver):
+    """Many periods of the clock, against piecewise exponentials."""
+    n = 60
+    want, end = buck(np.array([12.0, 0.55]), n)
+    sol = nsjax.solve(
+        Buck(), 0.0, n * Buck().T, Charge(12.0, 0.55), solver=SOLVERS[solver], stepsize_controller=pid(1e-11)
+    )
+    assert sol.result == RESULTS.successful and bool(sol.unique)
+    ticks = np.array([e.t for e in sol.events if e.switch == "carrier"])
+    np.testing.assert_array_equal(ticks, [(i + 1) * Buck().T for i in range(n)])
+    changes = [e.t for e in sol.events if e.switch == "comparator"]
+    assert len(changes) == len(want)
+    np.testing.assert_allclose(changes, want, atol=2e-9 * Buck().T)
+    np.testing.assert_allclose(flat(sol.y1), end, rtol=1e-8)
+
+
+class Square(nsjax.System):
+    """x' = v, v' = -x + a w(t - delay), w a square wave: written as one would, or as a switch of time."""
+
+    T: float = 1.7
+    duty: float = 0.4
+    delay: float = 0.0
+    a: float = 1.0
+
+    def vector_field(self, t, y, s):
+        high = (t - self.delay) / self.T % 1.0 < self.duty
+        return Motion(y.v, -y.x - 0.1 * y.v + self.a * jnp.where(high, 1.0, -1.0))
+
+    @nsjax.clock
+    def rises(self):
+        return self.T
+
+    @rises.offset
+    def rises(self):
+        return self.delay
+
+    @nsjax.clock
+    def falls(self):
+        return self.T
+
+    @falls.offset
+    def falls(self):
+        return self.delay + self.duty * self.T
+
+    @property
+    def period(self):
+        return self.T
+
+
+def square(t1: float, y0: np.ndarray, T: float = 1.7, duty: float = 0.4, delay: float = 0.0, a: float = 1.0) -> np.ndarray:
+    """By matrix exponentials."""
+    m = np.array([[0, 1, 0], [-1, -0.1, 1], [0, 0, 0]])
+    edges = sorted({delay + (n + d) * T for n in range(-5, 50) for d in (0, duty)} | {0.0, t1})
+    edges = [e for e in edges if min(0, t1) <= e <= max(0, t1)]
+    edges = edges if t1 > 0 else edges[::-1]
+    y = np.asarray(y0, float)
+    for b, e in zip(edges, edges[1:]):
+        high = ((b + e) / 2 - delay) / T % 1.0 < duty
+        y = (expm(m * (e - b)) @ np.append(y, a if high else -a))[:2]
+    return y
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("t1", [20.0, -3.0])
+def test_square_wave(solver, t1):
+    sol = nsjax.solve(
+        Square(delay=0.3), 0.0, t1, Motion(0.5, 0.0), solver=SOLVERS[solver], stepsize_controller=pid(1e-12)
+    )
+    np.testing.assert_allclose(flat(sol.y1), square(t1, np.array([0.5, 0.0]), delay=0.3), atol=1e-10)
+
+
+def test_derivatives_by_the_times_of_jumps():
+    """Of the state at the end by period, duty, delay and amplitude; against differences of the closed form."""
+    names, at = ("T", "duty", "delay", "a"), (1.7, 0.4, 0.3, 1.0)
+
+    def end(values):
+        system = Square(**dict(zip(names, values)))
+        return jnp.stack(nsjax.solve(system, 0.0, 20.0, Motion(0.5, 0.0), stepsize_controller=pid(1e-11)).y1)
+
+    got = jax.jacfwd(end)(jnp.asarray(at))
+    y0 = np.array([0.5, 0.0])
+    for i, step in enumerate(1e-5 * np.eye(4)):
+        up, down = (square(20.0, y0, **dict(zip(names, at + sign * step))) for sign in (1, -1))
+        np.testing.assert_allclose(got[:, i], (up - down) / 2e-5, atol=3e-8)
+
+
+def test_orbits():
+    """Forced by a square wave: the orbit in closed form, its multipliers those of the free oscillator; by shooting and
+    in segments."""
+    m = np.array([[0, 1], [-1, -0.1]])
+    phi = expm(m * 1.7)
+    free = square(1.7, np.zeros(2))
+    want = np.linalg.solve(np.eye(2) - phi, free)
+    for method in ("shooting", "segments"):
+        orbit = nsjax.find_orbit(Square(), Motion(0.1, 0.2), method=method)
+        np.testing.assert_allclose(flat(orbit.y0), want, atol=1e-10)
+        np.testing.assert_allclose(np.abs(orbit.multipliers), np.exp(-0.05 * 1.7), atol=1e-10)
+
+
+def buck_orbit(V_in: float) -> tuple[np.ndarray, np.ndarray]:
+    """The state at a tick of the orbit that conducts once a period, and its multipliers."""
+    p = Buck()
+    m = np.array([[-1 / (p.R * p.C), 1 / p.C], [-1 / p.L, 0]])
+    rest = np.linalg.solve(m, np.array([0, -V_in / p.L]))  # while it conducts
+
+    def state(d):
+        """At the tick, if it conducts from d to T."""
+        on, whole = expm(m * (p.T - d)), expm(m * p.T)
+        return np.linalg.solve(np.eye(2) - whole, rest - on @ rest)
+
+    def h(d):
+        ramp = p.V_low + (p.V_high - p.V_low) * d / p.T
+        return p.gain * ((expm(m * d) @ state(d))[0] - p.V_ref) - ramp
+
+    d = brentq(h, 0.3 * p.T, 0.7 * p.T, xtol=1e-18, rtol=1e-15)
+    y = expm(m * d) @ state(d)
+    n, h_t, jump = np.array([p.gain, 0]), -(p.V_high - p.V_low) / p.T, np.array([0, V_in / p.L])
+    saltation = np.eye(2) + np.outer(jump, n) / (n @ (m @ y) + h_t)
+    return state(d), np.linalg.eigvals(expm(m * (p.T - d)) @ saltation @ expm(m * d))
+
+
+@pytest.fixture(scope="module")
+def buck_at_20():
+    return nsjax.find_orbit(Buck(V_in=20.0), Charge(12.0, 0.55))
+
+
+def test_orbit_of_the_buck_converter(buck_at_20):
+    state, multipliers = buck_orbit(20.0)
+    np.testing.assert_allclose(flat(buck_at_20.y0), state, rtol=1e-9)
+    np.testing.assert_allclose(np.sort_complex(buck_at_20.multipliers), np.sort_complex(multipliers), atol=1e-8)
+    assert bool(buck_at_20.stable)
+
+
+@pytest.mark.slow
+def test_flip_of_the_buck_converter(buck_at_20):
+    """Continuation through the period doubling that opens its way to chaos, near 24.5 V."""
+    branch = nsjax.continue_orbit(Buck(V_in=20.0), buck_at_20, "V_in", (20.0, 25.0), max_branches=1)
+    (flip,) = [b for b in branch.bifurcations if "flip" in b.kind]
+    want = brentq(lambda V: buck_orbit(V)[1].real.min() + 1, 24.0, 25.0, xtol=1e-13)
+    np.testing.assert_allclose(flip.value, want, rtol=1e-9)
+
+
+def test_undeclared():
+    """A surface that jumps where nothing tells of it is found, whatever the solver; and one that jumps with the state."""
+
+    class Jumpy(nsjax.System):
+        at: str = "time"
+
+        def vector_field(self, t, y, s):
+            return Motion(y.v, -y.x - 0.3 * s.gate)
+
+        @nsjax.sgn
+        def gate(self, t, y):
+            jump = jnp.floor(t / 0.37) if self.at == "time" else jnp.where(y.v > 0.2, 1.0, -1.0)
+            return y.x - 0.2 * jump
+
+    for at in ("time", "state"):
+        for solver in SOLVERS.values():
+            sol = nsjax.solve(Jumpy(at=at), 0.0, 5.0, Motion(1.0, 0.0), solver=solver, throw=False)
+            assert sol.result == RESULTS.jump_in_time
+
+
+def test_kinks_are_no_jumps():
+    """A surface that is a continuous function of a sawtooth needs no clock (but steps)."""
+
+    class Triangle(nsjax.System):
+        def vector_field(self, t, y, s):
+            return Motion(y.v, -y.x - 0.3 * s.gate)
+
+        @nsjax.sgn
+        def gate(self, t, y):
+            return y.x - jnp.abs(t % 0.5 - 0.25)
+
+    sol = nsjax.solve(Triangle(), 0.0, 2.0, Motion(1.0, 0.0), throw=False)
+    assert sol.result == RESULTS.successful and len(sol.events) == 1
+    event = sol.events[0]
+    np.testing.assert_allclose(event.y_after.x, abs(float(event.t) % 0.5 - 0.25), atol=1e-9)
