@@ -109,7 +109,9 @@ class Model(eqx.Module):
             return self
         spans = [self.span(k, mode) for k in self.clocks]
         low, high = (ft.reduce(pick, ends) for pick, ends in zip((jnp.maximum, jnp.minimum), zip(*spans)))
-        return eqx.tree_at(lambda m: m.window, self, frozen((low, high)), is_leaf=lambda x: x is None or x is self.window)
+        return eqx.tree_at(
+            lambda m: m.window, self, frozen((low, high)), is_leaf=lambda x: x is None or x is self.window
+        )
 
     def at(self, t: Scalar) -> "Model":
         """The same for what sets out at time `t`."""

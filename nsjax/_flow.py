@@ -59,6 +59,7 @@ class _Attempt(NamedTuple):
     controller: PyTree
     result: RESULTS
     busy: Bool[Array, ""]  # whether one of them may have a root
+    touches: list[list[Bool[Array, ""]]]  # `[slot][part]`: whether it has one at the end of the solution
 
 
 class Flow(eqx.Module):
@@ -78,10 +79,13 @@ class Flow(eqx.Module):
     jumpy: tuple[bool, ...] = eqx.field(static=True)  # whether each guard holds an operation that may jump
     reverse: bool = eqx.field(static=True)  # whether the loop is to be transposed
 
-    def land(self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list, noise: list) -> Landing:
+    def land(
+        self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list, noise: list, touches: list
+    ) -> Landing:
         """The step once more, to its first event."""
         model = self.model.within(state.mode)
-        polynomials = once(self.stepper.scaled(model, lax.stop_gradient(coefficients)))
+        *first, last = once(self.stepper.scaled(model, lax.stop_gradient(coefficients)))
+        polynomials = [*first, jnp.where(model.stacked(touches, False), jnp.minimum(last, 0), last)]
         noises = model.stacked(lax.stop_gradient(noise), 0.0)
         return land(model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials, noises)
 
@@ -96,12 +100,12 @@ class Flow(eqx.Module):
         step = stepper(model, c.state, c.t, t_next, c.y, c.f, Watch(self.affine, self.controller))
         t_next = step.t_next
         keep, dt, controller, outcome = self.pace(c, step)
-        halvings, result = c.halvings, RESULTS.promote(outcome)
+        halvings, result, touches = c.halvings, RESULTS.promote(outcome), []
         if step.fits is not True:
             result = RESULTS.where(step.fits, result, RESULTS.mode_not_affine)
         busy = jnp.zeros((), bool)
         if model.slots:
-            known = model.known_roots(c.state)
+            known, touches = model.known_roots(c.state), self.touches(c, step)
             low = self.survey(step.guards, known)
             is_finite, quiet = low == low, low > 0
             result = RESULTS.where(keep & ~is_finite, RESULTS.nonfinite_field, result)
@@ -124,12 +128,28 @@ class Flow(eqx.Module):
                 ahead = ahead | (t_next >= tick)
                 # A step cut short by a tick says nothing against a longer one.
                 dt = jnp.where(keep & (t_next >= tick), jnp.maximum(dt, c.dt), dt)
-            busy = c.active & keep & is_finite & ~quiet & ahead
+            touching = ft.reduce(jnp.logical_or, [part for row in touches for part in row])
+            busy = c.active & keep & is_finite & ((~quiet & ahead) | touching)
         if self.reverse:
             # The derivatives of a rejected step that overflows are no numbers, and zero times that is none either.
             again = stepper(model, c.state, c.t, jnp.where(keep, t_next, c.t), c.y, c.f)
             step = step._replace(t_next=again.t_next, y1=again.y1, ks=again.ks, slope=again.slope)
-        return _Attempt(step, keep & c.active, dt, halvings, controller, result, busy)
+        return _Attempt(step, keep & c.active, dt, halvings, controller, result, busy, touches)
+
+    def touches(self, c: Carry, step: Step) -> list[list[Bool[Array, ""]]]:
+        """Which guards fall to zero at the very end of the solution, but for rounding of the time, of the step (whose
+        weights are numbers of some tens), or of their own."""
+        length = frozen(step.t_next) - frozen(c.t)
+        eps = float(jnp.finfo(length.dtype).eps)
+        far = 4 * eps * jnp.abs(frozen(step.t_next)) / jnp.where(length > 0, length, 1) + 256 * eps
+
+        def touches(c: list[Scalar], noise: Scalar) -> Bool[Array, ""]:
+            value, slope = self.stepper.end(c)
+            return (value > 0) & (slope < 0) & (value + far * slope <= noise)
+
+        final = (step.t_next >= self.t1) & (length > 0)
+        pairs = [zip(*rows) for rows in zip(frozen(step.guards), frozen(step.noise))]
+        return [[final & touches(c, noise) for c, noise in row] for row in pairs]
 
     def pace(self, c: Carry, step: Step) -> tuple[Any, Any, PyTree, Any]:
         """Whether a step is accurate enough, the length of the next, and the controller's state and verdict."""
@@ -199,6 +219,7 @@ class Flow(eqx.Module):
         if not model.slots:
             return end
         here = (c.t, t, c.y, c.f, c.state, lax.stop_gradient(step.guards), lax.stop_gradient(step.noise))
+        here = (*here, attempt.touches)
         there = _landed(attempt.busy, self, here, end)
         # A lane that looked for a root may have found none.
         event = attempt.busy & there.found

@@ -147,16 +147,19 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     dynamic = eqxi.while_loop(lambda c: eqxi.unvmap_any(c.active), body, dynamic, **kind)
     c: Carry = eqx.combine(dynamic, static)
     meter.close(c.meter)
+    # After an event at the very end the solution has no time left, but it moves with the difference of the two times.
+    late = jnp.where(c.t == stop, stop - c.t, 0)
+    y1, t_end = jax.tree.map(lambda y, f: y + f * late, c.y, c.f), c.t + late
     result = RESULTS.where(c.grazed & (c.result == RESULTS.successful), RESULTS.tangential_event, c.result)
     saved = c.saved
     if request.t1:
-        saved = saved.write(True, c.t, c.y, c.state.mode, system, direction)
+        saved = saved.write(True, t_end, y1, c.state.mode, system, direction)
     sol = Solution(
         system=system,
         t0=t0,
-        t1=c.t * direction,
+        t1=t_end * direction,
         mode0=_row(state.mode),
-        y1=c.y,
+        y1=y1,
         mode1=_row(c.state.mode),
         ts=saved.ts,
         ys=saved.ys,

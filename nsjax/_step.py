@@ -119,6 +119,10 @@ class Stepper(eqx.Module):
         out: here the smallest of its Bernstein coefficients, of which the first vanish with these roots."""
         return ft.reduce(jnp.minimum, [jnp.where(j < roots, 1, x) if j < 3 else x for j, x in enumerate(c)])
 
+    def end(self, c: list[Scalar]) -> tuple[Scalar, Scalar]:
+        """Value and slope of such a polynomial at the end of the step."""
+        return c[-1], (len(c) - 1) * (c[-1] - c[-2])
+
     def scaled(self, model: Model, guards: list[list[list[Scalar]]]) -> list[Float[Array, "slots parts"]]:
         """The polynomials of the guards as `_crossing` wants them: coefficients in Σ a_j u^j (1 - u)^(n - j)."""
         n = max(len(c) for row in guards for c in row) - 1

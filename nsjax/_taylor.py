@@ -265,6 +265,9 @@ class TaylorStepper(Stepper):
         low[-1] -= sum(map(jnp.abs, c[:n:-1]), jnp.zeros_like(low[-1]))
         return super().least(low, roots)
 
+    def end(self, c: list[Scalar]) -> tuple[Scalar, Scalar]:
+        return sum(c[::-1]), sum(j * x for j, x in reversed([*enumerate(c)]))
+
     def scaled(self, model: Model, guards: list[list[list[Scalar]]]) -> list[Float[Array, "slots parts"]]:
         powers = model.stacked([[jnp.stack(c) for c in row] for row in guards], -1.0)
         matrix = _from_powers(self.degree) * np.array(binomials(self.degree))[:, None]

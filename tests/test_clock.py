@@ -84,7 +84,9 @@ def buck(y0: np.ndarray, periods: int) -> tuple[list[float], np.ndarray]:
             if change is None:
                 z = expm(a * (ts[-1] - t)) @ z
                 break
-            e = brentq(lambda s: h(s, expm(a * (s - t)) @ z), ts[change] + 1e-15, ts[change + 1], xtol=1e-18, rtol=1e-15)
+            e = brentq(
+                lambda s: h(s, expm(a * (s - t)) @ z), ts[change] + 1e-15, ts[change + 1], xtol=1e-18, rtol=1e-15
+            )
             z, t, conducts = expm(a * (e - t)) @ z, e, not conducts
             times.append(e)
     return times, z[:2]
@@ -143,7 +145,9 @@ class Square(nsjax.System):
         return self.T
 
 
-def square(t1: float, y0: np.ndarray, T: float = 1.7, duty: float = 0.4, delay: float = 0.0, a: float = 1.0) -> np.ndarray:
+def square(
+    t1: float, y0: np.ndarray, T: float = 1.7, duty: float = 0.4, delay: float = 0.0, a: float = 1.0
+) -> np.ndarray:
     """By matrix exponentials."""
     m = np.array([[0, 1, 0], [-1, -0.1, 1], [0, 0, 0]])
     edges = sorted({delay + (n + d) * T for n in range(-5, 50) for d in (0, duty)} | {0.0, t1})

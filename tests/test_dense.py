@@ -81,3 +81,38 @@ def test_save_times(t1, ts, what):
 @jax.jit
 def _traced(ts, t1):
     return nsjax.solve(BELT, 0.0, t1, Motion(2.5, 0.0), saveat=dfx.SaveAt(ts=ts), throw=False).result
+
+
+class Ramp(nsjax.System):
+    """x' = 1 up to the surface, from where it is 3/4 of that."""
+
+    def vector_field(self, t, y, s):
+        return Motion(1 - 0.125 * (1 + s.knee), 0.0 * y.v)
+
+    @nsjax.sgn
+    def knee(self, t, y):
+        return y.x - 1.0
+
+
+@pytest.mark.parametrize("solver", [dfx.Tsit5(), dfx.Dopri8(), nsjax.Taylor(), nsjax.Exponential()])
+def test_events_at_the_end(solver):
+    """Issue 20.13, pitfall 9: an event exactly at the end is logged, and the end moves with the time that is asked for."""
+
+    def ends(t1):
+        sol = nsjax.solve(Ramp(), 0.1, t1, Motion(0.1, 0.0), solver=solver)
+        return sol.y1.x, (sol.events.num, sol.mode1, sol.t1)
+
+    slope, (num, mode, t1) = jax.jit(jax.jacfwd(ends, has_aux=True))(1.0)
+    assert (num, mode, t1) == (1, 1, 1.0)
+    np.testing.assert_allclose(slope, 0.75, rtol=1e-12)
+    early = jax.jit(ends)(1.0 - 1e-12)[1]
+    assert early[0] == 0 and early[1] == -1
+
+
+def test_orbit_based_on_an_event():
+    """Issue 20.5, pitfall 44: with its base point exactly where it stops sticking, an orbit has the multipliers that it
+    has elsewhere."""
+    exact = 10 + np.pi + 2 * np.arctan(0.2)
+    orbit = nsjax.find_orbit(BELT, Motion(2.0, 0.2), period=exact)
+    np.testing.assert_allclose(orbit.period, exact, rtol=1e-12)
+    np.testing.assert_allclose(np.sort(np.abs(orbit.multipliers)), [0, 1], atol=1e-10)
