@@ -108,10 +108,11 @@ def _check_affine(field: Callable[[Scalar, Y], Y], t: Scalar, y: Y, name: str) -
 
 
 def generator(
-    field: Callable[[Scalar, Flat], Flat], t: Scalar, x: Flat, f: Flat, dt: Scalar
+    field: Callable[[Scalar, Flat], Flat], t: Scalar, x: Flat, f: Flat, dt: Scalar, force: Scalar | None = None
 ) -> tuple[Square, Scalar, Bool[Array, ""]]:
     """The matrix M of a linear system z' = M z with time in units of `dt`, whose first components times the second
-    result are x(t + τ) - x(t), from z = (0, 1) or (0, 1, 0, 0); and whether it stands for the forcing.
+    result are x(t + τ) - x(t), from z = (0, 1) or (0, 1, 0, 0); and whether it stands for the forcing. `force` is the
+    size of the terms of f, if they may cancel.
 
     With b the forcing, b''' = -ω² b' for all of the kinds that are allowed, so that
     b(t + τ) - b(t) = b' S(τ) + b'' C(τ), where S' = 1 - ω² C, C' = S: sin(ωτ)/ω and (1 - cos ωτ)/ω².
@@ -136,7 +137,8 @@ def generator(
         fits = lax.stop_gradient(rest <= 1e7 * eps * rate * fast)
         # On a surface that holds the solution forcing cancels but for rounding, which is of no kind.
         moves = jnp.max(jnp.abs(b1)) * dt**2 + jnp.max(jnp.abs(b2)) * jnp.abs(dt) ** 3
-        still = moves <= 1e5 * eps * (jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(f)) * jnp.abs(dt))
+        force = jnp.max(jnp.abs(f)) if force is None else force
+        still = moves <= 1e5 * eps * (jnp.max(jnp.abs(x)) + force * jnp.abs(dt))
         still = lax.stop_gradient(still & ~fits)
         fits = fits | still
         b1, b2, squared = (jnp.where(still, 0, value) for value in (b1, b2, squared))
@@ -185,7 +187,7 @@ def expm(m: Square) -> Square:
 
 
 def _sampled(
-    field: Callable[[Scalar, Y], Y], t: Scalar, dt: Scalar, y: Y, f: Y
+    field: Callable[[Scalar, Y], Y], t: Scalar, dt: Scalar, y: Y, f: Y, force: Scalar | None = None
 ) -> tuple[list[Y], Y, Scalar, Bool[Array, ""]]:
     """The states at equal parts of a step, both ends included; what a polynomial through them misses, and how many
     times what may be missed that is; and whether the forcing is of a kind that is known."""
@@ -194,7 +196,7 @@ def _sampled(
     def flat(t: Scalar, x: Flat) -> Flat:
         return jfu.ravel_pytree(field(t, unravel(x)))[0]
 
-    m, scale, fits = generator(flat, t, x, jfu.ravel_pytree(f)[0], dt)
+    m, scale, fits = generator(flat, t, x, jfu.ravel_pytree(f)[0], dt, force)
     half = expm(m / (2 * _N))
     whole = half @ half
     z = [jnp.zeros(len(m), x.dtype).at[len(x)].set(1)]
@@ -245,7 +247,8 @@ class ExponentialStepper(Stepper):
     def __call__(
         self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watch | None = None
     ) -> Step:
-        ys, _, excess, fits = _sampled(lambda t, y: model.flow(t, y, state), t, t_next - t, y, f0)
+        force = model.force(t, y, state) if self.slides and model.holdable else None
+        ys, _, excess, fits = _sampled(lambda t, y: model.flow(t, y, state), t, t_next - t, y, f0, force)
         if not self.slides:
             fits = fits & ~ft.reduce(jnp.logical_or, [model.held(k, state.mode[k]) for k in model.holdable])
         step = Step(t_next, ys[-1], excess, ys, fits=fits)

@@ -101,7 +101,7 @@ class Model(eqx.Module):
                 slots += [Slot(k, sign, True) for sign in ((1,) if k in self.contacts else (1, -1))]
         self.slots = tuple(slots)
 
-    # Time, which is kept between the ticks of the clocks: at a tick a function of it is taken from the side of its mode.
+    # Time, which is kept between the ticks of the clocks: at a tick functions of it are taken from the mode's side.
 
     def within(self, mode: Mode) -> "Model":
         """The same for a mode, that tells between which ticks it is."""
@@ -296,6 +296,18 @@ class Model(eqx.Module):
         """The right-hand side in a mode; for a sliding one it is Filippov's field (2.19)."""
         self = self._in(state)
         return self.field(t, y, self.values(t, y, state))
+
+    def force(self, t: Scalar, y: Y, state: State) -> Scalar:
+        """The largest component of the terms that make up the field: with it those which cancel where it is held."""
+        self = frozen(self._in(state))
+        t, y = frozen((t, y))
+        s = self.values(t, y, state)
+        size = jax.tree.map(jnp.abs, self.field(t, y, s))
+        for k in self.holdable:
+            unit = tuple(jnp.where(i == k, s[k], 0) for i in range(len(s)))
+            pull = jax.jvp(lambda s: self.field(t, y, s), (s,), (unit,))[1]
+            size = jax.tree.map(lambda a, b: a + jnp.abs(b), size, pull)
+        return ft.reduce(jnp.maximum, [jnp.max(x) for x in jax.tree.leaves(size)])
 
     def project(self, t: Scalar, y: Y, state: State) -> Y:
         """Removes the drift off the surfaces that hold the solution.

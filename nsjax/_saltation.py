@@ -128,8 +128,10 @@ def _jump(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) ->
 def _matrix(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Float[Array, "n n"]:
     j = _jump(model, t, y, k, before, after)
     late = 1 + j.drest @ j.f_before + j.rest_t  # how much later the state of rest begins when the impact does
-    turn = j.f_after * late - j.dr @ j.f_before - j.r_t
-    return j.onto @ (j.dr - jnp.outer(j.f_after, j.drest) + jnp.outer(turn, j.n) / (j.n @ j.f_before + j.h_t))
+    turn = jnp.outer(j.f_after * late - j.dr @ j.f_before - j.r_t, j.n)
+    # At a tangency the matrix is infinite, but what does not depend on the time of the event stays as it is.
+    jump = j.dr - jnp.outer(j.f_after, j.drest) + jnp.where(turn == 0, 0, turn / (j.n @ j.f_before + j.h_t))
+    return j.onto @ jump if isinstance(model.switches[k], impact) else jump
 
 
 def saltation_matrix(
@@ -138,7 +140,8 @@ def saltation_matrix(
     """The saltation matrix of an event, by which the fundamental matrix jumps: Φ(t+) = S Φ(t-).
 
     S = DR + (f⁺ - DR f⁻ - R_t) nᵀ / (nᵀ f⁻ + h_t), with n = grad h: eq. (3.30) where the state does not jump (R = y)
-    and h does not depend on time, (3.32) where it does. At a tangency the denominator vanishes and S is infinite. For
+    and h does not depend on time, (3.32) where it does. At a tangency the denominator vanishes, and the entries that
+    depend on it are infinite. For
     an impact into resting contact R sums all impacts up to the accumulation point, whose time varies with the state.
 
     **Arguments:**

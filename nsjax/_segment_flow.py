@@ -57,6 +57,13 @@ class SegmentFlow(eqx.Module):
             return jfu.ravel_pytree(model.field(t, self.unravel(x), model.signs(t, state)))[0]
         return jfu.ravel_pytree(model.flow(t, self.unravel(x), state))[0]
 
+    def generator(self, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> tuple:
+        """Of the exact flow from time a to b, see `generator`."""
+        model = with_parameter(self.model, self.path, value)
+        force = model.force(a, self.unravel(x), state) if self.slides else None
+        f = self.field(a, x, value, state)
+        return generator(lambda t, x: self.field(t, x, value, state), a, x, f, b - a, force)
+
     def arrive(self, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> Array:
         """The state at time b of the flow from `x` at time a."""
         return _arrive(self, a, b, x, value, state)
@@ -98,8 +105,7 @@ def fits(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state:
     its odd derivatives vanish two frequencies look like one."""
 
     def at(t: Scalar) -> Array:
-        f = flow.field(t, x, value, state)
-        return generator(lambda t, x: flow.field(t, x, value, state), t, x, f, b - a)[2]
+        return flow.generator(t, t + (b - a), x, value, state)[2]
 
     return jnp.all(jax.vmap(at)(a + (b - a) * jnp.asarray([0.0, 0.2764, 0.6180], x.dtype)))
 
@@ -137,8 +143,7 @@ def _exponential(
     flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: State
 ) -> tuple[Array, Float[Array, "n n"]]:
     """The state at the end, and its derivative by that at the beginning."""
-    f = flow.field(a, x, value, state)
-    m, scale, good = generator(lambda t, x: flow.field(t, x, value, state), a, x, f, b - a)
+    m, scale, good = flow.generator(a, b, x, value, state)
     n, e = len(x), expm(m)
     return jnp.where(good, x + scale * e[:n, n], jnp.nan), e[:n, :n]
 
@@ -146,8 +151,7 @@ def _exponential(
 def _samples(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> Float[Array, "nodes n"]:
     """States at the nodes: from those at equal distances, with two derivatives, by Hermite's polynomials of degree
     five, which miss a 46080th of the sixth power of the phase between two of them."""
-    f = flow.field(a, x, value, state)
-    m, scale, good = generator(lambda t, x: flow.field(t, x, value, state), a, x, f, b - a)
+    m, scale, good = flow.generator(a, b, x, value, state)
     n, step = len(x), expm(m / NODES)
     z = jnp.zeros((len(m), 1), x.dtype).at[n, 0].set(1)
     while z.shape[1] < NODES:

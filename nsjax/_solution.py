@@ -62,13 +62,13 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "the signs in the method decorated with `.reset` (or a coefficient of restitution below 0)."
     )
     jump_penetrates = (
-        "At a tick of a clock an impact surface jumped beyond the state: h < 0 from then on. A gap may open at once, but "
-        "cannot close so."
+        "At a tick of a clock an impact surface jumped beyond the state: h < 0 from then on. A gap may open at once, "
+        "but cannot close so."
     )
     jump_in_time = (
-        "An indicator function jumps where nothing tells of it (`floor`, `%`, `round`, `where` or a table, of the time "
-        "or of the state). Declare the times at which it does as ticks of a `nsjax.clock`; what jumps with the state is "
-        "a switch of its own."
+        "An indicator function jumps where nothing tells of it (`floor`, `%`, `round`, `where` or a table, of the "
+        "time or of the state). Declare the times at which it does as ticks of a `nsjax.clock`; what jumps with the "
+        "state is a switch of its own."
     )
     equilibrium_not_found = (
         "No equilibrium was found: Newton's method did not converge. Start nearer to one, give another `mode`, or "

@@ -8,12 +8,12 @@ import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ._check import check_solve
 from ._filippov import Model, State
 from ._saltation import saltation_matrices, states
-from ._solution import Solution
+from ._solution import raise_if, RESULTS, Solution
 from ._solve import solve
 from ._system import arrays_of, System
 from ._types import Scalar, Y
@@ -48,6 +48,9 @@ def fundamental_matrix(
 
     **Returns:** Φ(t1, t0) of shape `(n, n)`, or Φ(ts, t0) of shape `(len(ts), n, n)`, for the state flattened by
     `ravel_pytree`.
+
+    **Raises:** a runtime error if the solution grazes a surface before a time at which Φ is wanted: it is not defined
+    there (with `throw=False` it is NaN).
     """
     if method not in ("variational", "autodiff"):
         raise ValueError(f"Argument `method` must be 'variational' or 'autodiff', but got {method!r}.")
@@ -66,19 +69,32 @@ def fundamental_matrix(
         throw=throw,
     )
     flat, unravel = jfu.ravel_pytree(y0)
+    times = jnp.asarray([t1] if ts is None else ts, t0.dtype)
     if method == "autodiff":
         saveat = dfx.SaveAt(t1=True) if ts is None else dfx.SaveAt(ts=jnp.asarray(ts, t0.dtype))
 
-        def flow(x: Array) -> Array:
-            ys = solve(system, t0, t1, unravel(x), saveat=saveat, **kwargs).ys
-            return jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(ys)
+        def flow(x: Array) -> tuple[Array, Solution]:
+            sol = solve(system, t0, t1, unravel(x), saveat=saveat, **kwargs)
+            return jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys), sol
 
-        phi = jax.jit(jax.jacfwd(flow))(flat)
-        return phi[0] if ts is None else phi
-    sol = solve(system, t0, t1, y0, **kwargs)
-    times = jnp.asarray([t1] if ts is None else ts, t0.dtype)
-    phi = _by_arcs(arrays_of(system, t0.dtype), sol, t0, y0, times, solver, controller, max_steps)
+        phi, sol = jax.jit(jax.jacfwd(flow, has_aux=True))(flat)
+    else:
+        sol = solve(system, t0, t1, y0, **kwargs)
+        whole, phi = _by_arcs(arrays_of(system, t0.dtype), sol, t0, y0, times, solver, controller, max_steps)
+        phi = whole[None] if ts is None else phi
+    beyond = _beyond_grazing(sol, t0, times)
+    phi = jnp.where(beyond[:, None, None], jnp.nan, phi)
+    if throw:
+        phi = raise_if(jnp.any(beyond), RESULTS.tangential_event, phi)
     return phi[0] if ts is None else phi
+
+
+def _beyond_grazing(sol: Solution, t0: Scalar, times: Float[Array, " times"]) -> Bool[Array, " times"]:
+    """Which times come after an event so tangential that there are no derivatives by what was before it."""
+    sign, events = jnp.where(sol.t1 >= t0, 1, -1), sol.events
+    grazes = events.transversality < jnp.cbrt(jnp.finfo(times.dtype).eps)  # not so in rows without an event
+    first = jnp.min(jnp.where(grazes, events.t * sign, jnp.inf), initial=jnp.inf)
+    return (sol.result == RESULTS.tangential_event) & ((times * sign > first) | (times == sol.t1))
 
 
 def arcs(sol: Solution, t0: Scalar, y0: Y) -> tuple[Array, Array, Y, Array]:
@@ -133,8 +149,9 @@ def _by_arcs(
     solver: dfx.AbstractSolver,
     controller: dfx.AbstractStepSizeController,
     max_steps: int,
-) -> Float[Array, "times n n"]:
-    """Φ on the arcs between the events of `sol`, and its jumps there."""
+) -> tuple[Float[Array, "n n"], Float[Array, "times n n"]]:
+    """Φ at the end of `sol`, with the jump of an event there, and at `times`, from the arcs between the events and the
+    jumps at these."""
     flat, unravel = jfu.ravel_pytree(y0)
     model = Model(system, jnp.ones_like(t0), t0, y0)
     n = flat.size
@@ -163,8 +180,8 @@ def _by_arcs(
         along = jax.vmap(matrix)(out.ys[1])
         return matrix(out.y1[1]), jnp.zeros_like(along).at[order].set(along)
 
-    _, by_arc = lax.scan(arc, eye, (begin, end, state, modes, jumps))
+    whole, by_arc = lax.scan(arc, eye, (begin, end, state, modes, jumps))
     # Each time belongs to the arc that ends at or after it; the first one wins, so that Φ is that before a jump.
     sign = jnp.where(sol.t1 >= t0, 1, -1)
     index = jnp.clip(jnp.searchsorted(sign * end, sign * times, side="left"), 0, len(end) - 1)
-    return by_arc[index, jnp.arange(len(times))]
+    return whole, by_arc[index, jnp.arange(len(times))]

@@ -116,3 +116,13 @@ def test_orbit_based_on_an_event():
     orbit = nsjax.find_orbit(BELT, Motion(2.0, 0.2), period=exact)
     np.testing.assert_allclose(orbit.period, exact, rtol=1e-12)
     np.testing.assert_allclose(np.sort(np.abs(orbit.multipliers)), [0, 1], atol=1e-10)
+
+
+def test_forced_orbit_based_on_an_event():
+    """The same where time says where the base point is: at the end of a stick phase, an ulp before it, and after it."""
+    system = gallery.thesis("6.8")
+    free = nsjax.find_orbit(system, gallery.entry("6.8").y0)
+    release = next(e for e in free.events if e.mode_before["friction"] == 0)
+    for t0 in (float(release.t), np.nextafter(float(release.t), 0), float(release.t) + 1e-13):
+        orbit = nsjax.find_orbit(system, release.y_after, t0=t0)
+        np.testing.assert_allclose(orbit.multipliers, free.multipliers, atol=1e-9)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import reference
 from jaxtyping import Array
-from models import flat, itinerary, Motion, Pair, Plane, times, with_change
+from models import flat, itinerary, Motion, Pair, pid, Plane, times, with_change
 
 import nsjax
 from nsjax import Exponential, gallery, RESULTS, solve
@@ -233,3 +233,43 @@ def test_float32():
     sol = solve(system, jnp.float32(0), jnp.float32(20), y0, solver=Exponential())
     assert sol.y1.x.dtype == jnp.float32
     np.testing.assert_allclose(flat(sol.y1), reference.stick_slip_final(np.array([0.5]), 20.0)[0], atol=2e-5)
+
+
+class Pressed(nsjax.System):
+    """Friction that holds against harmonic forcing."""
+
+    c: float = 1.0
+    a: float = 0.9
+    w: float = 1.3
+    f: float = 2.3
+    v: float = 1e-3
+
+    def vector_field(self, t, y, s):
+        return (-self.c * y[0] + self.a * jnp.cos(self.w * t) - self.f * s.belt,)
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y[0] - self.v
+
+
+def test_sticking_where_the_forcing_turns():
+    """Issue 20.11, pitfall 40: the forces cancel while it sticks, and their rounding is judged by them."""
+    rng = np.random.default_rng(0)
+    rows = {
+        name: rng.uniform(*ends, 127) for name, ends in dict(c=(0.1, 3), a=(0.1, 2), w=(0.3, 4), f=(0.5, 3)).items()
+    }
+    rows["v"] = 10 ** rng.uniform(-6, 0, 127)
+    many = {name: jnp.asarray(np.append(getattr(Pressed(), name), row)) for name, row in rows.items()}
+
+    @jax.jit
+    @jax.vmap
+    def ends(parameters):
+        exact, steps = (
+            solve(Pressed(**parameters), 0.0, 20.0, (0.5,), solver=solver, stepsize_controller=pid(1e-12), throw=False)
+            for solver in (Exponential(), nsjax.Taylor())
+        )
+        return exact.result, exact.events.num == steps.events.num, exact.y1[0] - steps.y1[0]
+
+    result, same, error = ends(many)
+    assert np.all(result == RESULTS.successful) and np.all(same)
+    np.testing.assert_allclose(error, 0, atol=1e-12)

@@ -95,3 +95,30 @@ def test_square_root_is_not_floored():
     """The derivative grows as the grazing is approached, like the inverse of the speed."""
     slopes = [jax.jacfwd(lambda gap: run(Touch(gap))[0])(gap)[1] * np.sqrt(-gap) for gap in (-1e-5, -1e-7, -1e-9)]
     np.testing.assert_allclose(slopes, 1.5 / np.sqrt(2) * np.cos(3), rtol=2e-2)
+
+
+@pytest.mark.parametrize("method", ["variational", "autodiff"])
+def test_fundamental_matrix_through_grazing(method):
+    """Issue 20.5: not defined beyond a tangential event, and said so; defined before it."""
+    args = dict(method=method, stepsize_controller=pid(1e-12))
+    with pytest.raises(Exception, match="met tangentially"):
+        nsjax.fundamental_matrix(Touch(), -np.pi, 3.0, Motion(-1.0, 0.0), **args)
+    phi = nsjax.fundamental_matrix(Touch(), -np.pi, 3.0, Motion(-1.0, 0.0), ts=[-1.0, 1.0], throw=False, **args)
+    turned = np.pi - 1.0
+    np.testing.assert_allclose(phi[0], [[np.cos(turned), np.sin(turned)], [-np.sin(turned), np.cos(turned)]], atol=1e-9)
+    assert np.all(np.isnan(phi[1]))
+
+
+def test_saltation_at_a_tangency_is_infinite():
+    """Issue 20.5: in the entries that depend on when the surface is met; the others stay as they are."""
+
+    class Push(Touch):
+        def vector_field(self, t, y, s):
+            return Motion(y.v, -y.x - 0.25 * (1 - s.wall))
+
+        @nsjax.sgn
+        def wall(self, t, y):
+            return 1.0 - y.x
+
+    matrix = nsjax.saltation_matrix(Push(), 0.0, Motion(1.0, 0.0), "wall", 1, -1)
+    np.testing.assert_array_equal(matrix, [[1, 0], [np.inf, 1]])
