@@ -59,6 +59,7 @@ from ._sweep import sweep as sweep
 from ._system import impact as impact, relay as relay, sgn as sgn, System as System
 from ._taylor import Taylor as Taylor
 from ._variational import fundamental_matrix as fundamental_matrix
+from ._version import __version__ as __version__
 from ._work_precision import (
     Method as Method,
     methods_for as methods_for,
