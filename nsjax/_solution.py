@@ -1,7 +1,7 @@
 """What `solve` returns: saved states, the event log, dense output, and why it ended."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._step import bernstein
 from ._system import System
-from ._types import Scalar, Y
+from ._types import Scalar, StateT, Y
 
 
 class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
@@ -110,19 +110,19 @@ def is_okay(result: RESULTS) -> Bool[Array, ""]:
     return (result == RESULTS.successful) | (result == RESULTS.tangential_event)
 
 
-class Event(NamedTuple):
+class Event(NamedTuple, Generic[StateT]):
     """One event of a solution, as `for event in sol.events` yields it."""
 
     t: Any
     switch: str
     mode_before: dict[str, int]
     mode_after: dict[str, int]
-    y_before: Any
-    y_after: Any
+    y_before: StateT
+    y_after: StateT
     transversality: Any
 
 
-class Events(eqx.Module):
+class Events(eqx.Module, Generic[StateT]):
     """The event log, in order of time, padded to `max_events` rows (time infinite, switch -1).
 
     **Attributes:**
@@ -152,7 +152,7 @@ class Events(eqx.Module):
     def __len__(self) -> int:
         return int(self.num)
 
-    def __getitem__(self, i: int) -> Event:
+    def __getitem__(self, i: int) -> Event[StateT]:
         n = len(self)
         if not -n <= i < n:
             raise IndexError(f"There are {n} events.")
@@ -165,7 +165,7 @@ class Events(eqx.Module):
         modes = named(self.mode_before[i]), named(self.mode_after[i])
         return Event(t, self.names[int(self.switch[i])], *modes, *rest)
 
-    def __iter__(self) -> Iterator[Event]:
+    def __iter__(self) -> Iterator[Event[StateT]]:
         return (self[i] for i in range(len(self)))
 
     def __str__(self) -> str:
@@ -210,7 +210,7 @@ class Itinerary(eqx.Module):
         return " -> ".join(", ".join(f"{n} {m:+d}" for n, m in row.items()) for row in self)
 
 
-class Solution(eqx.Module):
+class Solution(eqx.Module, Generic[StateT]):
     """The solution of a piecewise-smooth system.
 
     **Attributes:**
@@ -235,12 +235,12 @@ class Solution(eqx.Module):
     t0: Scalar
     t1: Scalar
     mode0: Int[Array, " switches"]
-    y1: Y
+    y1: StateT
     mode1: Int[Array, " switches"]
     ts: Float[Array, " times"] | None
     ys: Any
     modes: Int[Array, "times switches"] | None
-    events: Events
+    events: Events[StateT]
     stats: dict[str, Any]
     result: RESULTS
     unique: Bool[Array, ""]
@@ -252,7 +252,7 @@ class Solution(eqx.Module):
         e = self.events
         return Itinerary(self.mode0, e.switch, e.mode_after, e.num, e.names)
 
-    def evaluate(self, t: Any, left: bool = True) -> Y:
+    def evaluate(self, t: Any, left: bool = True) -> StateT:
         """The state at time `t` (scalar); at an event the one before it, or after it with `left=False`."""
         if self.dense is None:
             raise ValueError("Dense output was not kept; call `solve` with `saveat=SaveAt(dense=True)`.")
@@ -264,5 +264,5 @@ class Solution(eqx.Module):
         u = jnp.where(length > 0, (s - starts[i]) / jnp.where(length > 0, length, 1), 1.0)
         return bernstein(jax.tree.map(lambda p: p[i], points), u)
 
-    def __call__(self, t: Any, left: bool = True) -> Y:
+    def __call__(self, t: Any, left: bool = True) -> StateT:
         return self.evaluate(t, left)

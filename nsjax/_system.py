@@ -10,7 +10,7 @@ import dataclasses
 import functools as ft
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Self
+from typing import Any, Self, TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -83,6 +83,10 @@ class sgn(AbstractSwitch):
 
     breakaway_fn: Callable[[Any], Any] | None = None
 
+    if TYPE_CHECKING:
+
+        def __new__(cls, guard: Guard, *, name: str | None = None) -> "_Sgn": ...
+
     def breakaway(self, fn: Callable[[Any], Any]) -> Self:
         """Decorates `b(self)`, the bound >= 1 (dimensionless) which |λ| reaches before sliding ends."""
         return self._with(breakaway_fn=fn)
@@ -106,6 +110,10 @@ class relay(AbstractSwitch):
     """
 
     off_guard: Guard = None
+
+    if TYPE_CHECKING:
+
+        def __new__(cls, guard: Guard, *, name: str | None = None) -> "_Relay": ...
 
     def off(self, fn: Guard) -> Self:
         """Decorates `h_off(self, t, y)`: the relay switches off where it rises through zero."""
@@ -135,6 +143,10 @@ class impact(AbstractSwitch):
     reset_fn: Guard = None
     restitution_fn: Callable[[Any], Any] | None = None
 
+    if TYPE_CHECKING:
+
+        def __new__(cls, guard: Guard, *, name: str | None = None) -> "_Impact": ...
+
     def reset(self, fn: Guard) -> Self:
         """Decorates `reset(self, t, y) -> y_after`, of the structure of the state."""
         return self._with(reset_fn=fn)
@@ -142,6 +154,18 @@ class impact(AbstractSwitch):
     def restitution(self, fn: Callable[[Any], Any]) -> Self:
         """Decorates `e(self)`, Newton's coefficient of restitution (dimensionless, 0 <= e <= 1)."""
         return self._with(restitution_fn=fn)
+
+
+if TYPE_CHECKING:
+    # A switch is completed by a method of its own name (`@belt.breakaway def belt`), as a property is by its setter.
+    # To pyright that is a mistake, "obscured by a declaration of the same name", unless both declarations are of one
+    # class that derives from `property`. The decorators themselves must not: the type of `self.belt` would be that of a
+    # value of h. So they make instances of these, which exist for type checkers alone.
+    class _Sgn(sgn, property): ...
+
+    class _Relay(relay, property): ...
+
+    class _Impact(impact, property): ...
 
 
 @ft.cache  # switches are told apart by identity
