@@ -102,13 +102,13 @@ def _simulate(args: argparse.Namespace, job: Job, t0: float) -> Solution:
 
 
 class _Guess(NamedTuple):
-    """From where an orbit is sought."""
+    """A guess of an orbit."""
 
     y0: Any
     mode: dict[str, int] | None
-    period: float | None = None  # of an autonomous system; if None it is sought where the solution settles
-    order: int | None = None  # of a forced one, likewise
-    words: str = ""  # what was guessed
+    period: float | None = None  # of an autonomous system; None: that of the solution where it settles
+    order: int | None = None  # of a forced one; None: likewise
+    words: str = ""  # the period or order in words
 
 
 def _first_guess(args: argparse.Namespace, job: Job, y0: Any, mode: dict[str, int] | None) -> _Guess:
@@ -124,21 +124,18 @@ def _first_guess(args: argparse.Namespace, job: Job, y0: Any, mode: dict[str, in
 
 
 def _find(
-    args: argparse.Namespace,
-    job: Job,
-    t0: float,
-    first: tuple[Any, dict[str, int] | None],
-    settling: tuple | None = None,
+    args: argparse.Namespace, job: Job, t0: float, first: Start, settling: Start | None = None
 ) -> tuple[Orbit | None, str | None]:
     """An orbit, or why there is none.
 
-    The gallery's guesses are for its own parameters: if one fails after other parameters, or another start, were given,
-    the orbit is sought where the solution settles. An order that was asked for is kept to.
+    A guess of the gallery is for the gallery's parameters. If it fails where others, or another start, were given, the
+    orbit is searched for where the solution settles; so it is if a period that was given fails. An order that was asked
+    for is kept.
 
     **Arguments:**
 
-    - `first`: a state on the orbit, more or less, and its mode.
-    - `settling`: from where the solution is followed then; by default from the same.
+    - `first`: a guess of a state on the orbit, and of its mode.
+    - `settling`: from where the solution is followed to where it settles; by default from the same.
     """
     guess = _first_guess(args, job, *first)
     _note(f"looking for a periodic orbit of {guess.words or 'unknown period'}")

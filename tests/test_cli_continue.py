@@ -33,6 +33,7 @@ def continued(tmp_path_factory):
             "--out", folder / "pictures", "--json", folder / "numbers.json",
         )  # fmt: skip
     assert status == 0, err
+    assert "special points" in err  # how far it was, all the while
     return folder, out, json.loads((folder / "numbers.json").read_text(), parse_constant=pytest.fail), kept[0]
 
 

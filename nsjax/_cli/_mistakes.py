@@ -20,9 +20,10 @@ _ADVICE = {
     "autonomous), change parameters (--set), or see by `nsjax run` what the solution does.",
     "orbit_is_equilibrium": "the solution ends in an equilibrium. Start farther away from it (--y0), or change "
     "parameters (--set).",
-    "max_steps_reached": "the solution takes too many steps. Loosen --tol, or change --y0 or --set.",
-    "max_events_reached": "the solution has too many events. Change --y0 or --set; see by `nsjax run` where they crowd "
-    "together.",
+    "max_steps_reached": "the solution takes too many steps. Loosen --tol, change --y0 or --set, or for `run` shorten "
+    "--t1.",
+    "max_events_reached": "the solution has too many events. Change --y0 or --set, or for `run` shorten --t1 and see "
+    "whether they crowd together.",
 }
 
 
