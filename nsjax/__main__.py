@@ -270,7 +270,7 @@ def _continue(args: argparse.Namespace) -> int:
 
 def _complaint(error: BaseException, args: argparse.Namespace) -> str | None:
     """What is said of an error, instead of a page; `None` of one that this package is to blame for."""
-    report = mistake(error, model_file(args.system) if args.command != "list" else None)
+    report = mistake(error, None if args.command == "list" else model_file(args.system))
     if report is not None:
         return f"nsjax: error in {report}\n(--traceback shows all of it)"
     if isinstance(error, UsageError | OSError):
@@ -297,7 +297,7 @@ def main(argv: list[str] | None = None) -> int:
         return commands[args.command](args)
     except (Exception, SystemExit) as error:  # a model may end the program that imports it
         complaint = _complaint(error, args)
-        if complaint is None or (args.traceback and not isinstance(error, UsageError)):
+        if complaint is None or (getattr(args, "traceback", False) and not isinstance(error, UsageError)):
             raise
         print(complaint, file=sys.stderr)
         return USAGE

@@ -441,6 +441,14 @@ def test_list_names_every_system():
     assert [re.split(r"  +", line)[0] for line in out.splitlines()] == list(gallery.THESIS)
 
 
+def test_a_list_that_nobody_reads_to_its_end(monkeypatch):
+    def closed(*args, **kwargs):
+        raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr(command, "_list", closed)
+    assert run("list") == (2, "", "nsjax: error: [Errno 32] Broken pipe\n")
+
+
 def test_units_are_read_from_comments():
     assert notes(gallery.StickSlip)["c"] == ("damping", "N s/m")
     assert notes(gallery.Motion)["v"].unit == "m/s"
