@@ -65,6 +65,7 @@ from ._system import (
 )
 from ._taylor import Taylor as Taylor
 from ._variational import fundamental_matrix as fundamental_matrix
+from ._version import __version__ as __version__
 from ._work_precision import (
     Method as Method,
     methods_for as methods_for,

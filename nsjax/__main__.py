@@ -4,28 +4,36 @@ import argparse
 import json
 import pathlib
 import sys
-import traceback
-from typing import Any, NoReturn
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax
 
 from . import gallery
 from ._cli import (
+    advice,
     branch_record,
     Diagram,
     diagram_for,
     DIAGRAMS,
     draw,
     draw_branches,
+    first_line,
+    is_ours,
     Job,
     load,
+    mistake,
+    model_file,
     numbers,
     options,
     orbit_record,
+    parse,
+    raised_inside,
     record,
     report,
     simulation_record,
+    unknown,
+    USAGE,
     UsageError,
 )
 from ._continue_orbit import continue_orbit
@@ -37,72 +45,29 @@ from ._solution import is_okay, RESULTS, Solution
 from ._solve import solve
 
 
-USAGE, FAILURE = 2, 1  # exit status
+FAILURE = 1  # exit status of a numerical failure; `USAGE` is that of a mistake
+DEFAULT_TOL = 1e-12
+Start = tuple[Any, dict[str, int] | None]  # a state, and the modes that were given for it
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """One line, without the usage."""
-        self.exit(USAGE, f"{self.prog}: error: {message}\n")
+def _note(text: str) -> None:
+    """What is under way, for whoever waits: a stream that is no terminal is left to results and errors."""
+    if sys.stderr.isatty():
+        print(f"nsjax: {text} ...", file=sys.stderr)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="nsjax", description="Piecewise-smooth dynamics: the systems of Leine (2000), and your own.")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="{list,run,orbit,continue}")
-    commands.add_parser("list", help="list the systems of the gallery")
-    run = commands.add_parser("run", help="simulate a system, find its periodic orbit, write tables and pictures")
-    orbit = commands.add_parser("orbit", help="find a periodic orbit")
-    follow = commands.add_parser("continue", help="follow a periodic orbit while a parameter varies, with pictures")
-    for command in (run, orbit, follow):
-        add = command.add_argument
-        add("system", metavar="S", help="a key of `list`, such as 3.4, or a class of yours: path/model.py:ClassName")
-        add("--set", action="append", default=[], metavar="name=value", help="parameters, with commas or repeated")
-        add("--period", type=float, help="guess of the period of an orbit of an autonomous system")
-        add("--order", type=int, default=None, help="subharmonic order of an orbit of a forced system")
-        add("--mode", action="append", default=[], metavar="name=value", help="mode of a switch at the start: -1, 0, 1")
-        add("--tol", type=float, help="relative and absolute tolerance of the integration (default: 1e-12)")
-        add("--t0", type=float, help="start time")
-        add(
-            "--json",
-            metavar="FILE",
-            help="write the numbers as JSON; - is standard output, and nothing else goes there",
-        )
-    run.add_argument("--y0", metavar="x=..,v=..", help="where the simulation starts; names of the state, or numbers")
-    run.add_argument("--t1", type=float, help="end time (default: that of the gallery, 20 periods, or 100)")
-    run.add_argument(
-        "--branches",
-        action="store_true",
-        help=f"draw the diagrams of the thesis too, of {', '.join(DIAGRAMS)}: minutes",
-    )
-    for command in (orbit, follow):
-        command.add_argument(
-            "--y0", metavar="x=..,v=..", help="guess of a state on the orbit; names of the state, or numbers"
-        )
-    follow.add_argument("--param", metavar="NAME", help="the parameter that varies")
-    follow.add_argument("--range", metavar="LO,HI", help="of the parameter; the orbit is sought at its value in --set")
-    for command in (run, follow):
-        command.add_argument(
-            "--out", type=pathlib.Path, default=pathlib.Path("out"), help="folder for pictures (default: out)"
-        )
-    return parser
-
-
-def _joined(argv: list[str]) -> list[str]:
-    """`--y0 -1,0` as `--y0=-1,0`, which argparse would take for an option."""
-    found: list[str] = []
-    for word in argv:
-        if found and found[-1] in ("--y0", "--t0", "--t1", "--range") and word.startswith("-"):
-            found[-1] += f"={word}"
-        else:
-            found.append(word)
-    return found
-
-
-def _controller(tol: float | None) -> dict[str, Any]:
-    tol = 1e-12 if tol is None else tol
+def _tolerances(args: argparse.Namespace) -> dict[str, float]:
+    """Of the integration, and of Newton's method in the search for an orbit."""
+    tol = DEFAULT_TOL if args.tol is None else args.tol
     if not 0 < tol < 1:
         raise UsageError(f"--tol must lie between 0 and 1, but got {tol:g}.")
-    return dict(solver=dfx.Dopri8(), stepsize_controller=dfx.PIDController(rtol=tol, atol=tol))
+    return {"rtol": tol, "atol": tol, "newton": 100 * tol}
+
+
+def _controller(args: argparse.Namespace) -> dict[str, Any]:
+    tols = _tolerances(args)
+    controller = dfx.PIDController(rtol=tols["rtol"], atol=tols["atol"])
+    return dict(solver=dfx.Dopri8(), stepsize_controller=controller)
 
 
 def _mode(args: argparse.Namespace, job: Job) -> dict[str, int] | None:
@@ -110,7 +75,7 @@ def _mode(args: argparse.Namespace, job: Job) -> dict[str, int] | None:
     modes = {}
     for name, text in options(args.mode, "--mode").items():
         if name not in known:
-            raise UsageError(f"There is no switch {name!r}; possible: {', '.join(known) or 'none'}.")
+            raise unknown("switch", name, known)
         if text not in ("-1", "0", "1", "+1"):
             raise UsageError(f"The mode of {name} must be -1, 0 or 1, but got {text!r}.")
         modes[name] = int(text)
@@ -129,31 +94,77 @@ def _simulate(args: argparse.Namespace, job: Job, t0: float) -> Solution:
     t1 = job.t1 if args.t1 is None else args.t1
     if t1 is None:
         t1 = t0 + (100.0 if job.system.period is None else 20 * float(job.system.period))
+    _note(f"following the solution to t = {t1:g}")
     return solve(
         job.system, t0, t1, _start(job), mode=_mode(args, job), saveat=dfx.SaveAt(dense=True, t1=True),
-        max_steps=20_000, max_events=1024, throw=False, **_controller(args.tol),
+        max_steps=20_000, max_events=1024, throw=False, **_controller(args),
     )  # fmt: skip
 
 
+class _Guess(NamedTuple):
+    """A guess of an orbit."""
+
+    y0: Any
+    mode: dict[str, int] | None
+    period: float | None = None  # of an autonomous system; None: that of the solution where it settles
+    order: int | None = None  # of a forced one; None: likewise
+    words: str = ""  # the period or order in words
+
+
+def _first_guess(args: argparse.Namespace, job: Job, y0: Any, mode: dict[str, int] | None) -> _Guess:
+    """What was given, and the rest from the gallery."""
+    known = job.guess or gallery.OrbitGuess(y0)
+    period = known.period if args.period is None else args.period
+    order = known.order if args.order is None else args.order
+    if job.system.period is None:
+        words = "" if period is None else f"period {period:g}{'' if args.period else ' of the gallery'}"
+    else:
+        words = f"order {order}{' of the gallery' if args.order is None and job.guess else ''}"
+    return _Guess(y0, mode, period, order, words)
+
+
 def _find(
-    args: argparse.Namespace, job: Job, y0: Any, t0: float, mode: dict[str, int] | None
+    args: argparse.Namespace, job: Job, t0: float, first: Start, settling: Start | None = None
 ) -> tuple[Orbit | None, str | None]:
-    """An orbit, or why there is none."""
-    period, order = args.period, args.order
-    if job.guess is not None:
-        period = job.guess.period if period is None else period
-        order = job.guess.order if order is None else order
-    tol = {} if args.tol is None else {"tol": 100 * args.tol}
+    """An orbit, or why there is none.
+
+    A guess of the gallery is for the gallery's parameters. If it fails where others, or another start, were given, the
+    orbit is searched for where the solution settles; so it is if a period that was given fails. An order that was asked
+    for is kept.
+
+    **Arguments:**
+
+    - `first`: a guess of a state on the orbit, and of its mode.
+    - `settling`: from where the solution is followed to where it settles; by default from the same.
+    """
+    guess = _first_guess(args, job, *first)
+    _note(f"looking for a periodic orbit of {guess.words or 'unknown period'}")
+    orbit, trouble = _try(args, job, t0, guess)
+    departs = not job.from_gallery or any((args.set, args.y0, args.period, args.mode, args.t0))
+    if orbit is not None or not departs or not guess.words or args.order is not None:
+        return orbit, trouble
+    _note("looking for it where the solution settles")
+    order = 1 if job.system.period is None else None
+    orbit, later = _try(args, job, t0, _Guess(*(settling or first), order=order))
+    if orbit is None:
+        return None, f"neither with {guess.words} nor where the solution settles: {later}"
+    why = trouble.partition(". ")[0].rstrip(".")
+    found = f"an orbit of period {float(orbit.period):.10g}"
+    print(f"nsjax: with {guess.words}: {why}; found where the solution settles: {found}.", file=sys.stderr)
+    return orbit, None
+
+
+def _try(args: argparse.Namespace, job: Job, t0: float, guess: _Guess) -> tuple[Orbit | None, str]:
     try:
         orbit = find_orbit(
-            job.system, y0, period=period, t0=t0, order=1 if order is None else order, mode=mode, throw=False,
-            **_controller(args.tol), **tol,
+            job.system, guess.y0, period=guess.period, t0=t0, order=guess.order, mode=guess.mode, throw=False,
+            tol=_tolerances(args)["newton"], **_controller(args),
         )  # fmt: skip
     except RuntimeError as error:
-        return None, " ".join(str(error).split())
-    if orbit.result == RESULTS.successful:
-        return orbit, None
-    return None, " ".join(str(RESULTS[orbit.result]).split())
+        if mistake(error, model_file(args.system)) is not None:
+            raise
+        return None, first_line(error)
+    return (orbit, "") if orbit.result == RESULTS.successful else (None, advice(orbit.result))
 
 
 def _write_json(file: str | None, numbers: dict[str, Any]) -> None:
@@ -163,7 +174,9 @@ def _write_json(file: str | None, numbers: dict[str, Any]) -> None:
     if file == "-":
         sys.stdout.write(text)
     else:
-        pathlib.Path(file).write_text(text)
+        path = pathlib.Path(file)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
 
 
 def _list() -> int:
@@ -190,7 +203,10 @@ def _diagram(job: Job, parameter: str | None, interval: str | None) -> Diagram:
 
 
 def _branches(args: argparse.Namespace, job: Job, orbit: Orbit, diagram: Diagram) -> OrbitBranch:
-    return continue_orbit(job.system, orbit, diagram.parameter, diagram.interval, **_controller(args.tol))
+    laps = {"max_laps": args.max_laps} if args.command == "continue" else {}
+    return continue_orbit(
+        job.system, orbit, diagram.parameter, diagram.interval, **laps, progress=True, **_controller(args)
+    )
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -202,9 +218,9 @@ def _run(args: argparse.Namespace) -> int:
     sol = _simulate(args, job, t0)
     orbit, trouble = None, None
     if job.guess is not None:
-        orbit, trouble = _find(args, job, job.guess.y0, t0, None)
+        orbit, trouble = _find(args, job, t0, (job.guess.y0, None), (job.y0, _mode(args, job)))
     elif is_okay(sol.result) and (args.period is not None or not job.from_gallery):
-        orbit, trouble = _find(args, job, job.y0, t0, _mode(args, job))
+        orbit, trouble = _find(args, job, t0, (job.y0, _mode(args, job)))
     files = draw(job, sol, orbit, args.out)
     words = [report(job, sol, orbit, trouble)]
     found = {"simulation": simulation_record(sol), "orbit": None if orbit is None else orbit_record(orbit)}
@@ -215,7 +231,7 @@ def _run(args: argparse.Namespace) -> int:
         found["continuation"] = branch_record(branch)
     out = sys.stderr if args.json == "-" else sys.stdout
     print(*words, "", *files, sep="\n", file=out)
-    _write_json(args.json, record(job, **found))
+    _write_json(args.json, record(job, _tolerances(args), **found))
     return 0 if is_okay(sol.result) or sol.result == RESULTS.accumulation_reached else FAILURE
 
 
@@ -226,13 +242,13 @@ def _guess(args: argparse.Namespace, job: Job) -> Any:
 def _orbit(args: argparse.Namespace) -> int:
     job = load(args.system, options(args.set, "--set"), args.y0)
     t0 = job.t0 if args.t0 is None else args.t0
-    orbit, trouble = _find(args, job, _guess(args, job), t0, _mode(args, job))
+    orbit, trouble = _find(args, job, t0, (_guess(args, job), _mode(args, job)))
     if orbit is None:
         print(f"nsjax: no periodic orbit: {trouble}", file=sys.stderr)
         return FAILURE
     if args.json != "-":
         print(report(job, None, orbit, None))
-    _write_json(args.json, record(job, orbit=orbit_record(orbit)))
+    _write_json(args.json, record(job, _tolerances(args), orbit=orbit_record(orbit)))
     return 0
 
 
@@ -240,7 +256,7 @@ def _continue(args: argparse.Namespace) -> int:
     job = load(args.system, options(args.set, "--set"), args.y0)
     diagram = _diagram(job, args.param, args.range)
     t0 = job.t0 if args.t0 is None else args.t0
-    orbit, trouble = _find(args, job, _guess(args, job), t0, _mode(args, job))
+    orbit, trouble = _find(args, job, t0, (_guess(args, job), _mode(args, job)))
     if orbit is None:
         print(f"nsjax: no periodic orbit: {trouble}", file=sys.stderr)
         return FAILURE
@@ -248,35 +264,43 @@ def _continue(args: argparse.Namespace) -> int:
     files = draw_branches(job, branch, diagram, args.out)
     out = sys.stderr if args.json == "-" else sys.stdout
     print(report(job, None, None, None), "", branch, "", *files, sep="\n", file=out)
-    _write_json(args.json, record(job, **branch_record(branch)))
+    _write_json(args.json, record(job, _tolerances(args), **branch_record(branch)))
     return 0
 
 
-def _is_ours(error: BaseException) -> bool:
-    """Whether a `raise` of this package made it, and not the user's model or a bug."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    package = str(pathlib.Path(__file__).parent)
-    return last.filename.startswith(package) and (last.line or "").startswith("raise ")
+def _complaint(error: BaseException, args: argparse.Namespace) -> str | None:
+    """What is said of an error, instead of a page; `None` of one that this package is to blame for."""
+    report = mistake(error, None if args.command == "list" else model_file(args.system))
+    if report is not None:
+        return f"nsjax: error in {report}\n(--traceback shows all of it)"
+    if isinstance(error, UsageError | OSError):
+        return f"nsjax: error: {error}"
+    inside = raised_inside(error)
+    if inside is None and isinstance(error, TypeError | ValueError) and is_ours(error):
+        inside = first_line(error)
+    return None if inside is None else f"nsjax: error: {inside}"
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command line.
 
-    **Returns:** the exit status: 0, 1 for a numerical failure, 2 for a word that means nothing.
+    **Returns:** the exit status: 0, 1 for a numerical failure, 2 for a word that means nothing or a mistake in a model.
     """
     jax.config.update("jax_enable_x64", True)
-    args = _parser().parse_args(_joined(sys.argv[1:] if argv is None else argv))
     try:
-        commands = {"list": lambda _: _list(), "run": _run, "orbit": _orbit, "continue": _continue}
+        args = parse(sys.argv[1:] if argv is None else argv)
+    except UsageError as error:
+        print(f"nsjax: error: {error}", file=sys.stderr)
+        return USAGE
+    commands = {"list": lambda _: _list(), "run": _run, "orbit": _orbit, "continue": _continue}
+    try:
         return commands[args.command](args)
-    except (UsageError, OSError) as error:
-        message = str(error)
-    except (TypeError, ValueError) as error:  # a mistake in the model or in an argument
-        if not _is_ours(error):
+    except (Exception, SystemExit) as error:  # a model may end the program that imports it
+        complaint = _complaint(error, args)
+        if complaint is None or (getattr(args, "traceback", False) and not isinstance(error, UsageError)):
             raise
-        message = " ".join(str(error).split())
-    print(f"nsjax: error: {message}", file=sys.stderr)
-    return USAGE
+        print(complaint, file=sys.stderr)
+        return USAGE
 
 
 if __name__ == "__main__":

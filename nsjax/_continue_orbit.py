@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import os
 import warnings
+from typing import Generic
 
 import diffrax as dfx
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ from ._parameter import get_parameter, parameter_path
 from ._progress import ProgressLine
 from ._system import System
 from ._test_function import Test
-from ._types import Y
+from ._types import StateT, Y
 
 
 GIVEN = ("model", "path", "like", "how")  # what of a curve follows from the model, and is not saved
@@ -38,7 +39,7 @@ TYPES = {
 
 def continue_orbit(
     system: System,
-    orbit: Orbit,
+    orbit: Orbit[StateT],
     parameter: str,
     interval: tuple[float, float],
     *,
@@ -53,7 +54,7 @@ def continue_orbit(
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     max_steps: int = 4096,
-) -> OrbitBranch:
+) -> OrbitBranch[StateT]:
     """Follows a periodic orbit while a parameter varies, through smooth and discontinuous bifurcations, and along the
     branches that are born there.
 
@@ -122,7 +123,7 @@ def continue_orbit(
     return growth.branch
 
 
-class OrbitGrowth:
+class OrbitGrowth(Generic[StateT]):
     """A continuation that is under way: iterate over it, and look at `branch` at any time.
 
     ```python
@@ -143,7 +144,7 @@ class OrbitGrowth:
     def __init__(
         self,
         system: System,
-        orbit: Orbit,
+        orbit: Orbit[StateT],
         parameter: str,
         interval: tuple[float, float],
         *,
@@ -170,7 +171,7 @@ class OrbitGrowth:
         )
         self._tree = self._explorer.planted(spot)
 
-    def __iter__(self) -> "OrbitGrowth":
+    def __iter__(self) -> "OrbitGrowth[StateT]":
         return self
 
     def __next__(self) -> Spot:
@@ -185,7 +186,7 @@ class OrbitGrowth:
         raise StopIteration
 
     @property
-    def branch(self) -> OrbitBranch:
+    def branch(self) -> OrbitBranch[StateT]:
         """What was found so far."""
         curve, name = self._explorer.tracer.curve, self._explorer.name
         found = [orbit_branch(curve, curve.model.system, name, *pair, itinerary) for pair in self._tree.branches]

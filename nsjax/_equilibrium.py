@@ -1,6 +1,6 @@
 """Equilibria: in a region, on surfaces that hold them, and virtual ones."""
 
-from typing import Any
+from typing import Any, Generic
 
 import equinox as eqx
 import jax
@@ -15,10 +15,10 @@ from ._implicit import find_root
 from ._orbit import ravel
 from ._solution import RESULTS
 from ._system import frozen, impact, relay, System
-from ._types import Scalar, Y
+from ._types import Scalar, StateT, Y
 
 
-class Equilibrium(eqx.Module):
+class Equilibrium(eqx.Module, Generic[StateT]):
     """A state that does not change.
 
     **Attributes:**
@@ -42,7 +42,7 @@ class Equilibrium(eqx.Module):
     """
 
     system: System
-    y: Y
+    y: StateT
     mode: Int[Array, " switches"]
     multipliers: Float[Array, " switches"]
     jacobian: Float[Array, "n n"]

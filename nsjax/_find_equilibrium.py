@@ -17,7 +17,7 @@ from ._orbit import ravel
 from ._solution import raise_if, RESULTS
 from ._structure import is_constant
 from ._system import arrays_of, clock, impact, sgn, System
-from ._types import Y
+from ._types import StateT, Y
 
 
 MODES = 729  # so many modes at most are tried one by one
@@ -25,14 +25,14 @@ MODES = 729  # so many modes at most are tried one by one
 
 def find_equilibrium(
     system: System,
-    y0: Y,
+    y0: StateT,
     *,
     mode: Any = None,
     t: Any = 0.0,
     tol: float | None = None,
     max_iterations: int = 50,
     throw: bool = True,
-) -> Equilibrium:
+) -> Equilibrium[StateT]:
     """Finds an equilibrium by optimistix's Newton method: f(t, y, s) = 0 in a mode, on surfaces that hold it with their
     multipliers λ as unknowns beside the state (2.19)-(2.20).
 
@@ -73,14 +73,14 @@ def find_equilibrium(
 
 def find_equilibria(
     system: System,
-    starts: Y,
+    starts: StateT,
     *,
     mode: Any = None,
     virtual: bool = False,
     t: Any = 0.0,
     tol: float | None = None,
     max_iterations: int = 50,
-) -> list[Equilibrium]:
+) -> list[Equilibrium[StateT]]:
     """The different equilibria that Newton's method finds from many starting points in every mode.
 
     **Arguments:**

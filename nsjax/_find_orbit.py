@@ -19,7 +19,7 @@ from ._search import Search
 from ._solution import is_okay, raise_if
 from ._sweep import sweep
 from ._system import arrays_of, System
-from ._types import Y
+from ._types import StateT, Y
 
 
 def _inversion(y: Y) -> Y:
@@ -28,12 +28,12 @@ def _inversion(y: Y) -> Y:
 
 def find_orbit(
     system: System,
-    y0: Y,
+    y0: StateT,
     *,
     period: Any = None,
     t0: Any = 0.0,
     order: int | None = 1,
-    symmetry: Callable[[Y], Y] | Literal["inversion"] | None = None,
+    symmetry: Callable[[StateT], StateT] | Literal["inversion"] | None = None,
     backward: bool = False,
     mode: Any = None,
     method: Literal["shooting", "segments"] | None = None,
@@ -47,7 +47,7 @@ def find_orbit(
     max_events: int = 64,
     adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
     throw: bool = True,
-) -> Orbit:
+) -> Orbit[StateT]:
     """Finds a periodic orbit by optimistix's Newton method, in one of two formulations.
 
     *Shooting*, y(t0 + period) = y0, goes through the event-driven flow, which finds the itinerary. With *segments* the
@@ -158,7 +158,9 @@ def find_orbit(
     return orbit
 
 
-def find_orbits(system: System, starts: Y, *, period: Any = None, order: int = 1, **options: Any) -> list[Orbit]:
+def find_orbits(
+    system: System, starts: StateT, *, period: Any = None, order: int = 1, **options: Any
+) -> list[Orbit[StateT]]:
     """The different periodic orbits that `find_orbit` finds from many starting points, unstable ones included.
 
     **Arguments:**

@@ -1,7 +1,7 @@
 """A periodic orbit, with its Floquet multipliers."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Generic
 
 import diffrax as dfx
 import equinox as eqx
@@ -17,10 +17,10 @@ from ._saltation import saltation_matrices, states
 from ._solution import Events, Itinerary, RESULTS, Solution
 from ._solve import solve
 from ._system import System
-from ._types import Scalar, Y
+from ._types import Number, Scalar, StateT, Y
 
 
-class Orbit(eqx.Module):
+class Orbit(eqx.Module, Generic[StateT]):
     """A periodic solution.
 
     **Attributes:**
@@ -44,10 +44,10 @@ class Orbit(eqx.Module):
 
     system: System
     t0: Scalar
-    y0: Y
+    y0: StateT
     mode: Int[Array, " switches"]
     period: Scalar
-    events: Events
+    events: Events[StateT]
     monodromy: Float[Array, "n n"]
     multipliers: Complex[Array, " n"]
     structural_zeros: Int[Array, ""]
@@ -114,7 +114,7 @@ class Orbit(eqx.Module):
         """
         return path_of(self.system, self.arcs, samples, self.options)
 
-    def maximum(self, of: Callable[[Scalar, Y], Scalar]) -> Scalar:
+    def maximum(self, of: Callable[[Scalar, StateT], Number]) -> Scalar:
         """The largest value along the orbit of a quantity of the state, with derivatives by the parameters.
 
         ```python
@@ -129,7 +129,9 @@ class Orbit(eqx.Module):
         """
         return largest(self.system, self.arcs, self.options, of)
 
-    def solve(self, *, saveat: dfx.SaveAt = dfx.SaveAt(dense=True), periods: float = 1, **kwargs: Any) -> Solution:
+    def solve(
+        self, *, saveat: dfx.SaveAt = dfx.SaveAt(dense=True), periods: float = 1, **kwargs: Any
+    ) -> Solution[StateT]:
         """The solution over one or several periods from the base point; further arguments as for `nsjax.solve`.
 
         It leaves an orbit that is infinitely unstable at the surface that repels: see `path`.

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import os
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,13 +23,13 @@ from ._orbit_trace import midpoint, Spot
 from ._parameter import parameter_path, put_parameter
 from ._pencil import EigenvalueCrossing
 from ._system import System
-from ._types import Y
+from ._types import StateT, Y
 
 
 NOT_BIFURCATIONS = ("none", "end")
 
 
-class OrbitBranch(eqx.Module):
+class OrbitBranch(eqx.Module, Generic[StateT]):
     """A curve of periodic orbits over a parameter.
 
     **Attributes:**
@@ -73,10 +73,10 @@ class OrbitBranch(eqx.Module):
     special: tuple[OrbitBifurcation, ...]
     indices: tuple[int, ...]
     ends: tuple[str, str]
-    others: "tuple[OrbitBranch, ...]" = ()
+    others: "tuple[OrbitBranch[StateT], ...]" = ()
 
     @property
-    def branches(self) -> "tuple[OrbitBranch, ...]":
+    def branches(self) -> "tuple[OrbitBranch[StateT], ...]":
         """This one and the others."""
         return (self, *self.others)
 
@@ -98,7 +98,7 @@ class OrbitBranch(eqx.Module):
         path = parameter_path(self.system, self.parameter)
         return put_parameter(self.system, path, jnp.asarray(self.values[index]))
 
-    def orbit(self, index: int, **options: Any) -> Orbit:
+    def orbit(self, index: int, **options: Any) -> Orbit[StateT]:
         """The orbit at a point of the branch, for all that can be done with an `Orbit`.
 
         **Arguments:**

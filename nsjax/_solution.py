@@ -1,18 +1,19 @@
 """What `solve` returns: saved states, the event log, dense output, and why it ended."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from ._step import bernstein
 from ._system import System
-from ._types import Scalar, Y
+from ._types import Scalar, StateT, Y
 
 
 class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
@@ -123,19 +124,19 @@ def is_okay(result: RESULTS) -> Bool[Array, ""]:
     return (result == RESULTS.successful) | (result == RESULTS.tangential_event)
 
 
-class Event(NamedTuple):
+class Event(NamedTuple, Generic[StateT]):
     """One event of a solution, as `for event in sol.events` yields it."""
 
     t: Any
     switch: str
     mode_before: dict[str, int]
     mode_after: dict[str, int]
-    y_before: Any
-    y_after: Any
+    y_before: StateT
+    y_after: StateT
     transversality: Any
 
 
-class Events(eqx.Module):
+class Events(eqx.Module, Generic[StateT]):
     """The event log, in order of time, padded to `max_events` rows (time infinite, switch -1).
 
     **Attributes:**
@@ -165,7 +166,7 @@ class Events(eqx.Module):
     def __len__(self) -> int:
         return int(self.num)
 
-    def __getitem__(self, i: int) -> Event:
+    def __getitem__(self, i: int) -> Event[StateT]:
         n = len(self)
         if not -n <= i < n:
             raise IndexError(f"There are {n} events.")
@@ -178,7 +179,7 @@ class Events(eqx.Module):
         modes = named(self.mode_before[i]), named(self.mode_after[i])
         return Event(t, self.names[int(self.switch[i])], *modes, *rest)
 
-    def __iter__(self) -> Iterator[Event]:
+    def __iter__(self) -> Iterator[Event[StateT]]:
         return (self[i] for i in range(len(self)))
 
     def __str__(self) -> str:
@@ -228,7 +229,7 @@ def _clipped(x: Array, low: Any, high: Any) -> Array:
     return x + jax.lax.stop_gradient(jnp.clip(x, low, high) - x)
 
 
-class Solution(eqx.Module):
+class Solution(eqx.Module, Generic[StateT]):
     """The solution of a piecewise-smooth system.
 
     **Attributes:**
@@ -252,12 +253,12 @@ class Solution(eqx.Module):
     t0: Scalar
     t1: Scalar
     mode0: Int[Array, " switches"]
-    y1: Y
+    y1: StateT
     mode1: Int[Array, " switches"]
     ts: Float[Array, " times"] | None
     ys: Any
     modes: Int[Array, "times switches"] | None
-    events: Events
+    events: Events[StateT]
     stats: dict[str, Any]
     result: RESULTS
     unique: Bool[Array, ""]
@@ -269,7 +270,7 @@ class Solution(eqx.Module):
         e = self.events
         return Itinerary(self.mode0, e.switch, e.mode_after, e.num, e.names)
 
-    def evaluate(self, t: Any, left: bool = True) -> Y:
+    def evaluate(self, t: Any, left: bool = True) -> StateT:
         """The state at any time between `t0` and `t1`.
 
         **Arguments:**
@@ -294,7 +295,7 @@ class Solution(eqx.Module):
         # Times such as 0.1 + 0.2 are off by rounding, which is not meant.
         slack = 4 * float(jnp.finfo(starts.dtype).eps) * (jnp.abs(first) + jnp.abs(last))
         outside = ~((t * direction >= first - slack) & (t * direction <= last + slack))
-        if not isinstance(outside, jax.core.Tracer) and outside.any():
+        if not isinstance(outside, Tracer) and outside.any():
             wrong = np.ravel(np.asarray(t)[np.asarray(outside)])
             raise ValueError(
                 f"Argument `t` must lie between t0 = {float(self.t0):.10g} and t1 = {float(self.t1):.10g}, but got "
@@ -317,5 +318,5 @@ class Solution(eqx.Module):
 
         return jax.tree.map(shaped, ys)
 
-    def __call__(self, t: Any, left: bool = True) -> Y:
+    def __call__(self, t: Any, left: bool = True) -> StateT:
         return self.evaluate(t, left)

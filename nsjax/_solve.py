@@ -25,7 +25,7 @@ from ._step import RungeKutta, Stepper
 from ._structure import is_affine, may_jump
 from ._system import arrays_of, frozen, System
 from ._taylor import Taylor, TaylorStepper
-from ._types import Scalar, Y
+from ._types import Scalar, StateT, Y
 
 
 class _Options(NamedTuple):
@@ -239,7 +239,7 @@ def solve(
     system: System,
     t0: Any,
     t1: Any,
-    y0: Y,
+    y0: StateT,
     *,
     mode: Mapping[str, Any] | Sequence[Any] | None = None,
     solver: dfx.AbstractSolver = dfx.Tsit5(),
@@ -251,7 +251,7 @@ def solve(
     adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
     throw: bool = True,
     progress_meter: dfx.AbstractProgressMeter = dfx.NoProgressMeter(),
-) -> Solution:
+) -> Solution[StateT]:
     """Solves y' = f(t, y, s), s_k in Sgn(h_k(t, y)), from `t0` to `t1` (which may lie before it), event by event.
 
     Between events the field is smooth and `solver` steps it; every event is located to the accuracy of the method;

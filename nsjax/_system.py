@@ -10,7 +10,7 @@ import dataclasses
 import functools as ft
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Self
+from typing import Any, Self, TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -83,6 +83,10 @@ class sgn(AbstractSwitch):
 
     breakaway_fn: Callable[[Any], Any] | None = None
 
+    if TYPE_CHECKING:
+
+        def __new__(cls, guard: Guard, *, name: str | None = None) -> "_Sgn": ...
+
     def breakaway(self, fn: Callable[[Any], Any]) -> Self:
         """Decorates `b(self)`, the bound >= 1 (dimensionless) which |λ| reaches before sliding ends."""
         return self._with(breakaway_fn=fn)
@@ -106,6 +110,10 @@ class relay(AbstractSwitch):
     """
 
     off_guard: Guard = None
+
+    if TYPE_CHECKING:
+
+        def __new__(cls, guard: Guard, *, name: str | None = None) -> "_Relay": ...
 
     def off(self, fn: Guard) -> Self:
         """Decorates `h_off(self, t, y)`: the relay switches off where it rises through zero."""
@@ -136,6 +144,10 @@ class impact(AbstractSwitch):
     reset_fn: Guard = None
     inverse_fn: Guard = None
     restitution_fn: Callable[[Any], Any] | None = None
+
+    if TYPE_CHECKING:
+
+        def __new__(cls, guard: Guard, *, name: str | None = None) -> "_Impact": ...
 
     def reset(self, fn: Guard) -> Self:
         """Decorates `reset(self, t, y) -> y_after`, of the structure of the state."""
@@ -180,6 +192,10 @@ class clock(AbstractSwitch):
 
     offset_fn: Callable[[Any], Any] | None = None
 
+    if TYPE_CHECKING:
+
+        def __new__(cls, guard: Guard, *, name: str | None = None) -> "_Clock": ...
+
     def offset(self, fn: Callable[[Any], Any]) -> Self:
         """Decorates `t_0(self)`: the ticks are at t_0 + n T [time]."""
         return self._with(offset_fn=fn)
@@ -206,6 +222,20 @@ class clock(AbstractSwitch):
         if times.ndim == 0:
             return jnp.floor((t - start + blur) / times).astype(jnp.int32)
         return jnp.searchsorted(start + times, t + blur, side="right").astype(jnp.int32)
+
+
+if TYPE_CHECKING:
+    # A switch is completed by a method of its own name (`@belt.breakaway def belt`), as a property is by its setter.
+    # To pyright that is a mistake, "obscured by a declaration of the same name", unless both declarations are of one
+    # class that derives from `property`. The decorators themselves must not: the type of `self.belt` would be that of a
+    # value of h. So they make instances of these, which exist for type checkers alone.
+    class _Sgn(sgn, property): ...
+
+    class _Relay(relay, property): ...
+
+    class _Impact(impact, property): ...
+
+    class _Clock(clock, property): ...
 
 
 @ft.cache  # switches are told apart by identity

@@ -266,7 +266,7 @@ class TaylorStepper(Stepper):
         return super().least(low, roots)
 
     def end(self, c: list[Scalar]) -> tuple[Scalar, Scalar]:
-        return sum(c[::-1]), sum(j * x for j, x in reversed([*enumerate(c)]))
+        return sum(c[-2::-1], c[-1]), sum((j * x for j, x in reversed([*enumerate(c)])), jnp.zeros_like(c[0]))
 
     def scaled(self, model: Model, guards: list[list[list[Scalar]]]) -> list[Float[Array, "slots parts"]]:
         powers = model.stacked([[jnp.stack(c) for c in row] for row in guards], -1.0)

@@ -10,9 +10,11 @@ import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import nsjax
 from nsjax import __main__ as command, gallery
+from nsjax._cli._mistakes import advice
 from nsjax._cli._units import notes, ratio
 
 
@@ -85,6 +87,11 @@ def test_run_writes_the_numbers(run_34):
     numbers = run_34[2]
     assert numbers["system"] == "3.4"
     assert numbers["parameters"] == dict(m=1.0, c=0.0, k=1.0, v_dr=0.2, F_slip=1.0, F_stick=2.0)
+    units = numbers["units"]
+    assert (units["state"], units["time"], units["parameters"]["c"]) == ({"x": "m", "v": "m/s"}, "s", "N s/m")
+    assert set(units["parameters"]) == set(numbers["parameters"])
+    assert numbers["nsjax"] == nsjax.__version__
+    assert numbers["tolerances"] == {"rtol": 1e-12, "atol": 1e-12, "newton": pytest.approx(1e-10)}
     check_stick_slip_orbit(numbers["orbit"])
     simulation = numbers["simulation"]
     assert (simulation["t1"], simulation["mode1"], simulation["result"]) == (40.0, {"belt": 0}, "successful")
@@ -111,6 +118,46 @@ def test_impacts_accumulate_to_rest(tmp_path):
     assert first["y_after"]["v"] == pytest.approx(-0.8 * first["y"]["v"])
     np.testing.assert_allclose(np.diag(first["saltation"]), -0.8)
     assert {path.name for path in tmp_path.iterdir()} == {"1.1-3-time-series.png", "1.1-3-phase-portrait.png"}
+
+
+def damped_period(v_dr, c=0.1, slip=1.0, stick=2.0):
+    """Of section 6.7: from where the static force is reached in free flight to the belt's velocity, and back on it."""
+    start = stick - c * v_dr
+
+    def caught(t, y):
+        return y[1] - v_dr if t > 1e-3 else -1.0
+
+    caught.terminal, caught.direction = True, 1
+    flight = solve_ivp(
+        lambda t, y: [y[1], slip - c * y[1] - y[0]],
+        (0, 20),
+        [start, v_dr],
+        "DOP853",
+        events=caught,
+        rtol=1e-13,
+        atol=1e-13,
+    )
+    (duration,), ((x, _),) = flight.t_events[0], flight.y_events[0]
+    return duration + (start - x) / v_dr
+
+
+def test_other_parameters_than_the_gallerys_are_searched_from_nothing(tmp_path, monkeypatch):
+    """Item 17: the gallery's period, 12.635, is that of twice this orbit, more or less."""
+    told = ("--set", "v_dr=0.5", "--y0", "x=2.5,v=0")
+    status, out, err = run("orbit", "6.7", *told, "--json", "-")
+    assert status == 0, err
+    assert json.loads(out)["orbit"]["period"] == pytest.approx(damped_period(0.5), abs=1e-8)
+    assert err.count("\n") == 1 and re.search("period 12.635 of the gallery.*where the solution settles.*7.6346", err)
+    orbits = []
+
+    def follow(system, orbit, *args, **kwargs):
+        orbits.append((orbit, kwargs["max_laps"]))
+        raise OSError("enough")
+
+    monkeypatch.setattr(command, "continue_orbit", follow)
+    run("continue", "6.7", *told, "--max-laps", "2", "--out", tmp_path)
+    ((orbit, laps),) = orbits
+    assert float(orbit.period) == pytest.approx(damped_period(0.5), abs=1e-8) and laps == 2
 
 
 THERMOSTAT = """
@@ -166,10 +213,16 @@ def test_state_that_is_an_array(thermostat, tmp_path, monkeypatch):
         ("walk 3.4", "list.*run.*orbit"),
         ("run", "required"),
         ("run 9.9", r"'9\.9'.*3\.4.*6\.9.*model\.py:ClassName"),
+        ("run 6.77", r"'6\.77'.*Did you mean 6\.7 \(Stick-slip"),
+        ("run StickSlp", r"Did you mean 3\.4 \(Stick-slip"),
         ("run nowhere.py:A", r"no file 'nowhere\.py'"),
-        ("run nowhere.py", "model.py:ClassName"),
+        ("run nowhere.py", r"no file 'nowhere\.py'"),
         ("orbit 3.4 --set q=1", "'q'.*m, c, k, v_dr"),
         ("orbit 3.4 --set m=1,q=1", "'q'"),
+        ("orbit 3.4 --set vdr=1", "'vdr'.*Did you mean 'v_dr'"),
+        ("orbit 3.4 --set f_stick=1", "Did you mean 'F_stick'"),
+        ("orbit 3.4 --y0 V=1", "'V'.*Did you mean 'v'"),
+        ("orbit 3.4 --mode bel=1", "'bel'.*Did you mean 'belt'"),
         ("orbit 3.4 --set m=heavy", "m must be a number.*'heavy'"),
         ("orbit 3.4 --set m=nan", "number"),
         ("orbit 3.4 --set m", "name=value"),
@@ -180,8 +233,12 @@ def test_state_that_is_an_array(thermostat, tmp_path, monkeypatch):
         ("orbit 3.4 --mode belt=2", "-1, 0 or 1"),
         ("orbit 3.4 --tol 0", "between 0 and 1"),
         ("orbit 3.4 --period long", "long"),
-        ("orbit 3.4 --order 2", "period"),
-        ("orbit 3.5 --period 3", "order"),
+        ("orbit 3.4 --order 2", "--order must be 1.*--period"),
+        ("orbit 3.4 --order 0", "--order: invalid positive integer"),
+        ("orbit 3.5 --period 3", "--period must not.*--order"),
+        ("orbit 3.4 --json /dev/null/numbers.json", "--json: '/dev/null' is a file"),
+        ("orbit 3.4 --json /", "--json: '/' is a folder"),
+        ("run 3.4 --out /dev/null/pictures", "--out: '/dev/null' is a file"),
     ],
 )
 def test_mistakes(argv, words):
@@ -204,9 +261,114 @@ def test_mistakes_with_a_file(thermostat, name, argv, words):
     assert status == 2 and err.count("\n") == 1 and re.search(words, err), err
 
 
-def test_errors_of_the_model_itself_keep_their_traceback(thermostat):
-    with pytest.raises(ValueError, match="user's own"):
-        run("run", thermostat.replace("Thermostat", "Careless"), "--y0", "1,2")
+def test_files_are_checked_before_the_work(monkeypatch):
+    """Item 17."""
+    monkeypatch.setattr(command, "load", lambda *args: pytest.fail("began"))
+    monkeypatch.setattr("tempfile.TemporaryFile", lambda dir: open("/proc/nothing/here", "w"))
+    for argv in ("run 3.4 --out pictures", "orbit 3.4 --json made/numbers.json"):
+        status, _, err = run(*argv.split())
+        assert status == 2 and re.search("cannot be written: No such file", err) and err.count("\n") == 1
+
+
+def test_checks_leave_nothing_behind(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(*"run 3.4 --set q=1 --out a/b --json c/d.json".split())[0] == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_json_makes_its_folder(tmp_path, monkeypatch):
+    class Found:
+        result = nsjax.RESULTS.successful
+
+    monkeypatch.setattr(command, "find_orbit", lambda *args, **kwargs: Found)
+    monkeypatch.setattr(command, "report", lambda *args: "report")
+    monkeypatch.setattr(command, "orbit_record", lambda orbit: {})
+    assert run("orbit", "3.4", "--json", tmp_path / "deep" / "numbers.json")[0] == 0
+    assert json.loads((tmp_path / "deep" / "numbers.json").read_text())["system"] == "3.4"
+
+
+def test_a_file_with_one_model_needs_no_name(thermostat, tmp_path, monkeypatch):
+    """Item 17: classes count, be there a base or an instance of it."""
+    seen = []
+    monkeypatch.setattr(command, "find_orbit", lambda system, *args, **kwargs: seen.append(system))
+    path, _, _ = thermostat.rpartition(":")
+    status, _, err = run("orbit", path, "--y0", "1,2")
+    assert status == 2 and err.count("\n") == 1
+    assert f"has 2 systems; name one: {path}:Thermostat, {path}:Careless" in err
+    single = tmp_path / "single.py"
+    text = THERMOSTAT.replace(
+        "class Thermostat(nsjax.System)", "class Base(nsjax.System):\n    pass\n\nclass One(Base)"
+    )
+    single.write_text(text.partition("class Careless")[0] + "warm = One(k=2.0)\n")
+    with pytest.raises(AttributeError):  # of the None found
+        run("orbit", single, "--set", "k=3", "--y0", "1,2")
+    assert type(seen[0]).__name__ == "One" and seen[0].k == 3.0
+    (tmp_path / "none.py").write_text("import nsjax")
+    assert "no class of nsjax.System" in run("orbit", tmp_path / "none.py")[2]
+
+
+def test_a_file_that_is_meant(thermostat, monkeypatch):
+    path, _, _ = thermostat.rpartition(":")
+    assert "Did you mean" in run("orbit", path.replace("thermo", "termo"), "--y0", "1,2")[2]
+    monkeypatch.chdir(pathlib.Path(path).parent)
+    assert "Did you mean thermo.py?" in run("orbit", "thermo")[2]
+
+
+@pytest.mark.parametrize(
+    "old, new, line, words",
+    [
+        ("", "", 'raise ValueError("of the user\'s own")', "ValueError: of the user's own"),
+        ('raise ValueError("of the user\'s own")', "return s.heater", "return s.heater", "AttributeError.*no switch"),
+        (
+            'raise ValueError("of the user\'s own")',
+            "return y if y[0] > 0 else -y",
+            "return y if",
+            "BoolConv.*jnp.where",
+        ),
+        ('raise ValueError("of the user\'s own")', "return np.sin(y)", "return np.sin", "ArrayConv.*jax.numpy"),
+        ('raise ValueError("of the user\'s own")', "return open('gone')", "return open", "FileNotFoundError"),
+        ("import nsjax", "import nsjax, nothing_there", "import nsjax, nothing", "ModuleNotFoundError: No module"),
+        ("import nsjax", "import nsjax; import sys; sys.exit(3)", "import nsjax; ", "SystemExit: 3"),
+        ("import nsjax", "import nsjax; x = (", "import nsjax; x = (", "SyntaxError: '[(]' was never closed"),
+    ],
+)
+def test_a_mistake_in_the_model_is_a_short_report(thermostat, old, new, line, words):
+    """Item 17: the user's own line, whatever it called, and no page of tracebacks."""
+    path = pathlib.Path(thermostat.rpartition(":")[0])
+    path.write_text(THERMOSTAT.replace("import jax.numpy as jnp", "import numpy as np").replace(old, new))
+    number = next(i for i, text in enumerate(path.read_text().splitlines(), 1) if line in text)
+    argv = ("orbit", f"{path}:Careless", "--y0", "1.0,2.0", "--period", "1")
+    status, out, err = run(*argv)
+    assert (status, out) == (2, "")
+    first, code, what, rest = err.splitlines()
+    assert first.startswith(f"nsjax: error in thermo.py, line {number}") and line in code
+    assert re.search(words, what) and "--traceback" in rest
+    with pytest.raises((Exception, SystemExit), match=None) as caught:
+        command.main([*argv, "--traceback"])
+    assert type(caught.value).__name__ in what
+
+
+def test_an_error_within_a_program_is_one_line(tmp_path):
+    """Item 17: equinox would put the stack of the compiler around it."""
+    (tmp_path / "ball.py").write_text(
+        "import nsjax\n"
+        "class Ball(nsjax.System):\n"
+        "    def vector_field(self, t, y, s):\n"
+        "        return {'x': y['v'], 'v': -1.0 - s.floor}\n"
+        "    @nsjax.impact\n"
+        "    def floor(self, t, y):\n"
+        "        return y['x']\n"
+        "    @floor.restitution\n"
+        "    def floor(self):\n"
+        "        return 0.5\n"
+    )
+    status, _, err = run("run", tmp_path / "ball.py", "--y0", "x=1,v=0", "--out", tmp_path)
+    assert status == 2 and err.count("\n") == 1 and re.search("sign with which a contact force.*Change its sign", err)
+
+
+def test_version(capsys):
+    """Item 17."""
+    assert run("--version") == (0, f"nsjax {nsjax.__version__}\n", "")
 
 
 def test_no_orbit_is_status_1(monkeypatch):
@@ -220,21 +382,54 @@ def test_no_orbit_is_status_1(monkeypatch):
 
 
 def test_options_reach_the_search(monkeypatch):
-    seen = {}
+    tries = []
 
     def search(system, y0, **kwargs):
-        seen.update(kwargs, system=system, y0=y0)
-        raise RuntimeError
+        tries.append(dict(kwargs, system=system, y0=y0))
+        raise RuntimeError("lost")
 
     monkeypatch.setattr(command, "find_orbit", search)
-    run("orbit", "6.9", "--set", "omega=1.7,k=2", "--set", "m=3", "--y0", "-1,2", "--tol", "1e-9", "--mode", "belt=-1")
-    assert (seen["system"].omega, seen["system"].k, seen["system"].m) == (1.7, 2.0, 3.0)
-    assert tuple(seen["y0"]) == (-1.0, 2.0) and seen["mode"] == {"belt": -1}
-    assert (seen["order"], seen["period"]) == (2, None)  # the guess of the gallery
-    assert isinstance(seen["stepsize_controller"], dfx.PIDController) and seen["stepsize_controller"].rtol == 1e-9
+    argv = "orbit 6.9 --set omega=1.7,k=2 --set m=3 --y0 -1,2 --tol 1e-9 --mode belt=-1".split()
+    status, _, err = run(*argv)
+    assert status == 1 and err.count("\n") == 1
+    assert re.search("neither with order 2 of the gallery nor where the solution settles: lost", err)
+    for seen in tries:
+        assert (seen["system"].omega, seen["system"].k, seen["system"].m) == (1.7, 2.0, 3.0)
+        assert tuple(seen["y0"]) == (-1.0, 2.0) and seen["mode"] == {"belt": -1}
+        assert isinstance(seen["stepsize_controller"], dfx.PIDController) and seen["stepsize_controller"].rtol == 1e-9
+        assert seen["tol"] == pytest.approx(1e-7)
+    # The guess of the gallery, and then none: other parameters may have an orbit of another order.
+    assert [(seen["order"], seen["period"]) for seen in tries] == [(2, None), (None, None)]
+    tries.clear()
     run("orbit", "6.9", "--order", "1", "--y0", "v=0.5", "--t0", "1")
+    (seen,) = tries  # an order that is asked for is kept to
     assert (seen["order"], seen["t0"]) == (1, 1.0)
     assert seen["y0"] == gallery.Motion(jnp.asarray(1.0), jnp.asarray(0.5))  # the rest is the gallery's start
+    tries.clear()
+    run("orbit", "6.7", "--period", "20")
+    assert [(seen["order"], seen["period"]) for seen in tries] == [(1, 20.0), (1, None)]
+    tries.clear()
+    run("orbit", "6.7")
+    assert [seen["period"] for seen in tries] == [12.635]
+
+
+@pytest.mark.parametrize(
+    "result, words",
+    [
+        ("orbit_not_found", "--y0.*--period.*--set"),
+        ("orbit_is_equilibrium", "--y0.*--set"),
+        ("orbit_is_multiple_cover", r"Divide --period \(or --order\)"),
+        ("max_steps_reached", "--tol"),
+        ("max_events_reached", "--y0"),
+        ("wrong_mode", "--mode places"),
+        ("start_penetrates", "Put --y0"),
+        ("repulsive_sliding", "--mode name=0"),
+    ],
+)
+def test_advice_names_options(result, words):
+    """Item 17: an error names what can be changed from the command line."""
+    said = advice(getattr(nsjax.RESULTS, result))
+    assert re.search(words, said) and not re.search(r"`(y0|period|order|mode)`|max_steps|max_events", said)
 
 
 # What stands around it.
@@ -244,6 +439,14 @@ def test_list_names_every_system():
     status, out, _ = run("list")
     assert status == 0
     assert [re.split(r"  +", line)[0] for line in out.splitlines()] == list(gallery.THESIS)
+
+
+def test_a_list_that_nobody_reads_to_its_end(monkeypatch):
+    def closed(*args, **kwargs):
+        raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr(command, "_list", closed)
+    assert run("list") == (2, "", "nsjax: error: [Errno 32] Broken pipe\n")
 
 
 def test_units_are_read_from_comments():

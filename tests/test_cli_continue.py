@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from test_cli import run
 
+import nsjax
 from nsjax import __main__ as command, _cli
 from nsjax._cli._report import _symbol
 
@@ -32,6 +33,7 @@ def continued(tmp_path_factory):
             "--out", folder / "pictures", "--json", folder / "numbers.json",
         )  # fmt: skip
     assert status == 0, err
+    assert "special points" in err  # how far it was, all the while
     return folder, out, json.loads((folder / "numbers.json").read_text(), parse_constant=pytest.fail), kept[0]
 
 
@@ -57,6 +59,8 @@ def test_it_draws_the_pictures(continued):
 def test_the_numbers_are_the_branch(continued):
     _, _, numbers, branch = continued
     assert (numbers["system"], numbers["parameter"]) == ("6.7", "v_dr")
+    assert numbers["nsjax"] == nsjax.__version__ and numbers["tolerances"]["rtol"] == 1e-12
+    assert numbers["units"]["parameters"]["v_dr"] == numbers["units"]["state"]["v"] == "m/s"
     assert len(numbers["branches"]) == len(branch.branches)
     for written, one in zip(numbers["branches"], branch.branches):
         points = written["points"]
@@ -84,6 +88,14 @@ def test_special_points_are_told_once(continued):
     assert None in special["multipliers"][1]
     assert special["count"] == [[1, 1], []] and special["crossings"] == []
     assert special["transition"] == branch.special[0].transition and special["surfaces"] == ["belt"]
+    # Item 17: which branches meet there.
+    halves = special["halves"]
+    assert [(h["side"], h["laps"]) for h in halves] == [(-1, 1), (-1, 1)]
+    assert sorted(h["stable"] for h in halves) == [False, True]
+    for written, half in zip(halves, branch.special[0].halves):
+        assert written["itinerary"] == half.itinerary and written["stable"] == half.stable
+        pairs = zip(written["multipliers"], half.multipliers)
+        assert all(pair is None if np.isinf(exact) else complex(*pair) == exact for pair, exact in pairs)
     assert numbers["branches"][0]["special"] == [{"point": branch.indices[0], "special": 0}]
 
 
@@ -128,7 +140,8 @@ def test_run_with_branches_continues_its_orbit(continued, monkeypatch, tmp_path)
         ("continue 6.7 --range 1,0.5", "the lower one first"),
         ("continue 6.7 --range 0,much", "An end of --range must be a number"),
         ("continue 6.7 --range -2,-1", r"v_dr = 0\.2 lies outside \[-2, -1\].*--set v_dr"),
-        ("continue 6.7 --param q --range 0,1", "`parameter` must be one of"),
+        ("continue 6.7 --param q --range 0,1", "--param must be one of"),
+        ("continue 6.7 --max-laps 0", "--max-laps: invalid positive integer"),
         ("run 3.4 --branches", r"--branches is for 6\.6, 6\.7, 6\.8, 6\.9"),
     ],
 )

@@ -12,6 +12,7 @@ PACKAGE = pathlib.Path(__file__).parents[1] / "nsjax"
 
 # Bottom to top: a module imports only modules named before it.
 ORDER = (
+    "_version",
     "_types",
     "_once",
     "_progress",

@@ -273,6 +273,16 @@ def _special(special: OrbitBifurcation) -> dict[str, Any]:
         "multipliers": [_pairs(side) for side in special.multipliers],
         "crossings": [{"q": c.q, "eigenvalue": [c.eigenvalue.real, c.eigenvalue.imag]} for c in special.crossings],
         "count": [list(map(int, side)) for side in special.count],
+        "halves": [
+            {
+                "side": int(half.side),
+                "laps": int(half.laps),
+                "multipliers": _pairs(half.multipliers),
+                "stable": bool(half.stable),
+                "itinerary": half.itinerary,
+            }
+            for half in special.halves
+        ],
         "surfaces": list(special.surfaces),
         "transition": special.transition,
     }

@@ -1,12 +1,14 @@
 """Which system, with which parameters, from which state: reading the words of the command line."""
 
 import dataclasses
+import difflib
 import importlib.util
+import inspect
 import math
 import pathlib
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import ModuleType
 from typing import Any
 
@@ -72,8 +74,17 @@ def options(texts: list[str], flag: str) -> dict[str, str]:
     return found
 
 
-def _unknown(what: str, name: str, known: list[str]) -> UsageError:
-    return UsageError(f"There is no {what} {name!r}; possible: {', '.join(known) or 'none'}.")
+def unknown(what: str, name: str, known: Iterable[str]) -> UsageError:
+    """That a name means nothing, with the one that may have been meant, and all that there are."""
+    known = list(known)
+    return UsageError(f"There is no {what} {name!r}.{_meant(name, known)} Possible: {', '.join(known) or 'none'}.")
+
+
+def _meant(name: str, known: Iterable[str]) -> str:
+    """The nearest of the names, whatever their case, as a question."""
+    plain = {one.lower(): one for one in reversed(list(known))}
+    near = difflib.get_close_matches(name.lower(), plain, n=1)
+    return f" Did you mean {plain[near[0]]!r}?" if near else ""
 
 
 # The system.
@@ -84,34 +95,56 @@ def load(name: str, parameters: Mapping[str, str], y0: str | None) -> Job:
 
     **Arguments:**
 
-    - `name`: a key of the gallery, or `path/model.py:ClassName`.
+    - `name`: a key of the gallery, or `path/model.py:ClassName`, or `path/model.py` of a file with one model.
     - `parameters`: values in words, by name.
     - `y0`: `"x=1,v=0"`, or `"1,0"`; `None` for the default.
 
     **Raises:** `UsageError`, naming what is possible.
     """
-    if ".py" in name:
-        return _load_file(name, parameters, y0)
+    parts = _file_and_name(name)
+    if parts is not None:
+        return _load_file(*parts, parameters, y0)
     try:
         entry = gallery.entry(name)
     except ValueError:
-        keys = ", ".join(gallery.THESIS)
-        raise UsageError(
-            f"There is no system {name!r}; possible: {keys}; or a file of yours, model.py:ClassName."
-        ) from None
+        raise _unknown_system(name) from None
     system = _make(entry.system, dataclasses.fields(entry.system()), parameters)
     start = entry.y0 if y0 is None else _state(y0, type(entry.y0), entry.y0._asdict())
     return Job(entry.key, entry.title, system, _arrays(start), entry.y0._fields, entry.t0, entry.t1, entry.orbit, True)
 
 
-def _load_file(name: str, parameters: Mapping[str, str], y0: str | None) -> Job:
-    path, _, attribute = name.rpartition(":")
-    if not path.endswith(".py") or not attribute:
-        raise UsageError(f"A system of yours must read path/model.py:ClassName, but got {name!r}.")
+def _unknown_system(name: str) -> UsageError:
+    """Keys may be meant, or what the gallery calls its systems; or a file."""
+    if pathlib.Path(f"{name}.py").is_file():
+        return UsageError(f"There is no system {name!r}. Did you mean {name}.py?")
+    called = {key.lower(): key for key in gallery.THESIS}
+    for key, entry in gallery.THESIS.items():
+        for words in (type(entry.system()).__name__, entry.title):
+            called.setdefault(words.lower(), key)
+    near = difflib.get_close_matches(name.lower(), called, n=1)
+    meant = f" Did you mean {called[near[0]]} ({gallery.entry(called[near[0]]).title})?" if near else ""
+    keys = ", ".join(gallery.THESIS)
+    return UsageError(f"There is no system {name!r}.{meant} Possible: {keys}; or a file of yours, model.py:ClassName.")
+
+
+def _file_and_name(name: str) -> tuple[str, str] | None:
+    """`path/model.py` and `ClassName`, which may be missing; `None` for a key of the gallery."""
+    found = re.fullmatch(r"(.*\.py)(?::(.*))?", name)
+    return None if found is None else (found[1], found[2] or "")
+
+
+def model_file(name: str) -> pathlib.Path | None:
+    """The file of the model that is meant; `None` for one of the gallery."""
+    parts = _file_and_name(name)
+    return None if parts is None else pathlib.Path(parts[0])
+
+
+def _load_file(path: str, attribute: str, parameters: Mapping[str, str], y0: str | None) -> Job:
     module = _module(pathlib.Path(path))
-    names = [key for key, value in vars(module).items() if _is_model(value, module)]
-    if attribute not in names:
-        raise _unknown(f"system in {path}:", attribute, names)
+    models = {key: value for key, value in vars(module).items() if _is_model(value, module)}
+    attribute = attribute or _only(path, models)
+    if attribute not in models:
+        raise unknown(f"system in {path}:", attribute, models)
     found = getattr(module, attribute)
     if isinstance(found, System):
         system = _make(lambda **changes: dataclasses.replace(found, **changes), dataclasses.fields(found), parameters)
@@ -123,12 +156,26 @@ def _load_file(name: str, parameters: Mapping[str, str], y0: str | None) -> Job:
     else:
         start = _arrays(cls(**cls._field_defaults)) if cls and set(cls._fields) == set(cls._field_defaults) else None
     title = (type(system).__doc__ or "").strip().partition("\n")[0]
-    return Job(name, title, system, start, cls._fields if cls else (), 0.0, None, None, False)
+    if title.startswith(f"{type(system).__name__}("):  # the signature, which is there where nothing was written
+        title = ""
+    state = cls._fields if cls else ()
+    return Job(f"{path}:{attribute}", title, system, start, state, 0.0, None, None, False)
+
+
+def _only(path: str, models: Mapping[str, Any]) -> str:
+    """The one that is meant where none is named: the only class, or if there is none the only instance."""
+    classes = [key for key, value in models.items() if isinstance(value, type) and not inspect.isabstract(value)]
+    choice = classes or list(models)
+    if len(choice) != 1:
+        many = f"{len(choice)} systems; name one: {', '.join(f'{path}:{key}' for key in choice)}"
+        raise UsageError(f"{path} has {many}." if choice else f"There is no class of nsjax.System in {path}.")
+    return choice[0]
 
 
 def _module(path: pathlib.Path) -> ModuleType:
     if not path.is_file():
-        raise UsageError(f"There is no file {str(path)!r}.")
+        beside = [str(other) for other in sorted(path.parent.glob("*.py"))] if path.parent.is_dir() else []
+        raise UsageError(f"There is no file {str(path)!r}.{_meant(str(path), beside)}")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -150,7 +197,7 @@ def _make(make: Callable[..., System], fields: tuple[Any, ...], parameters: Mapp
     values = {}
     for name, text in parameters.items():
         if name not in known:
-            raise _unknown("parameter", name, list(known))
+            raise unknown("parameter", name, list(known))
         values[name] = _parameter(known[name], text)
     try:
         return make(**values)
@@ -211,7 +258,7 @@ def _state(text: str, cls: Any, defaults: Mapping[str, Any]) -> Any:
         return named
     for name in named:
         if name not in cls._fields:
-            raise _unknown("state", name, list(cls._fields))
+            raise unknown("state", name, list(cls._fields))
     values = {**defaults, **named}
     missing = [name for name in cls._fields if name not in values]
     if missing:

@@ -14,8 +14,10 @@ from .._saltation import saltation_matrices
 from .._solution import Events, RESULTS, Solution
 from .._system import System
 from .._types import Y
+from .._version import __version__
 from ..plot import components
 from ._job import Job
+from ._mistakes import advice
 from ._units import Note, notes, ratio
 
 
@@ -68,11 +70,6 @@ def _symbol(name: str) -> str:
 
 def _with_unit(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit else name
-
-
-def message(result: RESULTS) -> str:
-    """What a result says, on one line."""
-    return " ".join(str(RESULTS[result]).split())
 
 
 # Text.
@@ -148,7 +145,7 @@ def _simulation_text(job: Job, sol: Solution, units: Units) -> str:
     text += _event_table(sol.events, units, SHOWN) if len(sol.events) else "  no events"
     text += f"\n  at t = {_number(sol.t1)}{unit}: {_state_text(sol.y1, units)}"
     if sol.result != RESULTS.successful:
-        text += f"\n  ended there: {message(sol.result)}"
+        text += f"\n  ended there: {advice(sol.result)}"
     return text
 
 
@@ -239,10 +236,28 @@ def simulation_record(sol: Solution) -> dict[str, Any]:
         "y1": named(sol.y1),
         "mode1": dict(zip(sol.events.names, jnp.asarray(sol.mode1).tolist())),
         "events": _events(sol.system, sol.events),
-        "result": "successful" if sol.result == RESULTS.successful else message(sol.result),
+        "result": "successful" if sol.result == RESULTS.successful else advice(sol.result),
     }
 
 
-def record(job: Job, **parts: Any) -> dict[str, Any]:
-    """Everything computed, ready for `json.dump`."""
-    return _plain({"system": job.name, "parameters": _parameters(job.system), **parts})
+def record(job: Job, tolerances: dict[str, float], **parts: Any) -> dict[str, Any]:
+    """Everything computed, ready for `json.dump`.
+
+    **Arguments:**
+
+    - `job`: the system.
+    - `tolerances`: with which it was computed.
+    - `parts`: what was.
+    """
+    units = Units.of(job)
+    known = {name: note.unit for name, note in units.parameters.items() if name in _parameters(job.system)}
+    return _plain(
+        {
+            "nsjax": __version__,
+            "system": job.name,
+            "parameters": _parameters(job.system),
+            "units": {"parameters": known, "state": units.state, "time": units.time},
+            "tolerances": tolerances,
+            **parts,
+        }
+    )

@@ -6,14 +6,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._system import sgn, SwitchValues, System
-from .._types import Scalar
+from .._types import Number, Scalar
 from ._friction import falling
 
 
 class Slip(NamedTuple):
     """State of the block."""
 
-    v: Float[Array, ""]  # velocity relative to the floor [m/s]
+    v: Number  # velocity relative to the floor [m/s]
 
 
 class _Block(System):
@@ -48,7 +48,7 @@ class _StickingBlock(_Block):
     """A block that sticks at v = 0."""
 
     @sgn
-    def floor(self, t: Scalar, y: Slip) -> Scalar:
+    def floor(self, t: Scalar, y: Slip) -> Number:
         return y.v
 
 

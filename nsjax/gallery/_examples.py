@@ -2,30 +2,28 @@
 
 from typing import NamedTuple
 
-from jaxtyping import Array, Float
-
 from .._system import sgn, SwitchValues, System
-from .._types import Scalar
+from .._types import Number, Scalar
 
 
 class Line(NamedTuple):
     """State of the one-dimensional examples."""
 
-    x: Float[Array, ""]
+    x: Number
 
 
 class Plane(NamedTuple):
     """State of the two-dimensional examples."""
 
-    x1: Float[Array, ""]
-    x2: Float[Array, ""]
+    x1: Number
+    x2: Number
 
 
 class _OnLine(System):
     """The surface x = 0."""
 
     @sgn
-    def surface(self, t: Scalar, y: Line) -> Scalar:
+    def surface(self, t: Scalar, y: Line) -> Number:
         return y.x
 
 
@@ -35,7 +33,7 @@ class _InPlane(System):
     c: float = 1.0  # position of the surface; ours
 
     @sgn
-    def surface(self, t: Scalar, y: Plane) -> Scalar:
+    def surface(self, t: Scalar, y: Plane) -> Number:
         return y.x2 - self.c
 
 

@@ -9,26 +9,25 @@ ours.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .._system import sgn, SwitchValues, System
-from .._types import Scalar
+from .._types import Number, Scalar
 from ._examples import Line, Plane
 
 
 class Space(NamedTuple):
     """State of the three-dimensional example."""
 
-    x1: Float[Array, ""]
-    x2: Float[Array, ""]
-    x3: Float[Array, ""]
+    x1: Number
+    x2: Number
+    x3: Number
 
 
 class Polar(NamedTuple):
     """State in polar coordinates (5.26)."""
 
-    r: Float[Array, ""]
-    theta: Float[Array, ""]  # [rad]
+    r: Number
+    theta: Number  # [rad]
 
 
 def _smooth_abs(h: Scalar, epsilon: Scalar) -> Scalar:
@@ -56,7 +55,7 @@ class NoCrossing(System):
         return Plane(y.x2, self.mu - 3 * y.x1 - 2 * s.kink * y.x1 - 2.5 * y.x2)
 
     @sgn
-    def kink(self, t: Scalar, y: Plane) -> Scalar:
+    def kink(self, t: Scalar, y: Plane) -> Number:
         return y.x1
 
 
@@ -84,7 +83,7 @@ class DoubleHopfCrossing(System):
         return Space(y.x2 - 2 * y.x1 + size, y.x3 - 2 * y.x1 - size, self.mu - 3.36 * y.x1)
 
     @sgn
-    def kink(self, t: Scalar, y: Space) -> Scalar:
+    def kink(self, t: Scalar, y: Space) -> Number:
         return y.x1
 
 
@@ -120,7 +119,7 @@ class DiscontinuousSaddleNode(System):
         return Line(self.mu - s.kink * y.x)
 
     @sgn
-    def kink(self, t: Scalar, y: Line) -> Scalar:
+    def kink(self, t: Scalar, y: Line) -> Number:
         return y.x
 
 
@@ -159,11 +158,11 @@ class DiscontinuousTranscritical(System):
         return Line(s.parameter * self.mu / 2 - s.kink * self.kink(t, y))
 
     @sgn
-    def kink(self, t: Scalar, y: Line) -> Scalar:
+    def kink(self, t: Scalar, y: Line) -> Number:
         return y.x - self.mu / 2
 
     @sgn
-    def parameter(self, t: Scalar, y: Line) -> Scalar:
+    def parameter(self, t: Scalar, y: Line) -> Number:
         return jnp.asarray(self.mu / 2)
 
 
@@ -222,11 +221,11 @@ class DiscontinuousPitchfork(System):
         return Line(self.alpha * y.x + s.left * self.left(t, y) - s.right * self.right(t, y))
 
     @sgn
-    def left(self, t: Scalar, y: Line) -> Scalar:
+    def left(self, t: Scalar, y: Line) -> Number:
         return y.x + self.mu / 2
 
     @sgn
-    def right(self, t: Scalar, y: Line) -> Scalar:
+    def right(self, t: Scalar, y: Line) -> Number:
         return y.x - self.mu / 2
 
 
@@ -297,11 +296,11 @@ class DiscontinuousHopf(System):
         return Plane(growth * y.x1 - self.omega * y.x2, self.omega * y.x1 + growth * y.x2)
 
     @sgn
-    def plus(self, t: Scalar, y: Plane) -> Scalar:
+    def plus(self, t: Scalar, y: Plane) -> Number:
         return y.x1**2 + y.x2**2 + self.mu * jnp.abs(self.mu) / 4
 
     @sgn
-    def minus(self, t: Scalar, y: Plane) -> Scalar:
+    def minus(self, t: Scalar, y: Plane) -> Number:
         return y.x1**2 + y.x2**2 - self.mu * jnp.abs(self.mu) / 4
 
 
@@ -322,11 +321,11 @@ class PolarHopf(System):
         return Polar(growth, jnp.full_like(y.theta, self.omega))
 
     @sgn
-    def plus(self, t: Scalar, y: Polar) -> Scalar:
+    def plus(self, t: Scalar, y: Polar) -> Number:
         return y.r + self.mu / 2
 
     @sgn
-    def minus(self, t: Scalar, y: Polar) -> Scalar:
+    def minus(self, t: Scalar, y: Polar) -> Number:
         return y.r - self.mu / 2
 
 
@@ -353,19 +352,19 @@ class HopfPitchfork(System):
         return Plane(y.x2, -y.x1 + at_x1 - y.x2 - at_x2)
 
     @sgn
-    def left(self, t: Scalar, y: Plane) -> Scalar:
+    def left(self, t: Scalar, y: Plane) -> Number:
         return y.x1 + self.mu
 
     @sgn
-    def right(self, t: Scalar, y: Plane) -> Scalar:
+    def right(self, t: Scalar, y: Plane) -> Number:
         return y.x1 - self.mu
 
     @sgn
-    def below(self, t: Scalar, y: Plane) -> Scalar:
+    def below(self, t: Scalar, y: Plane) -> Number:
         return y.x2 + self.mu
 
     @sgn
-    def above(self, t: Scalar, y: Plane) -> Scalar:
+    def above(self, t: Scalar, y: Plane) -> Number:
         return y.x2 - self.mu
 
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._system import sgn, SwitchValues, System
-from .._types import Scalar
+from .._types import Number, Scalar
 from ._motion import Motion
 
 
@@ -31,7 +31,7 @@ class ForcedFriction(System):
         return Motion(y.v, (force - self.c * y.v - self.k * y.x) / self.m)
 
     @sgn
-    def friction(self, t: Scalar, y: Motion) -> Scalar:
+    def friction(self, t: Scalar, y: Motion) -> Number:
         return y.v
 
     @friction.breakaway
@@ -69,7 +69,7 @@ class ForcedStickSlip(System):
         return Motion(y.v, (friction + self.f_0 * jnp.cos(self.omega * t) - self.k * y.x) / self.m)
 
     @sgn
-    def belt(self, t: Scalar, y: Motion) -> Scalar:
+    def belt(self, t: Scalar, y: Motion) -> Number:
         return y.v - self.v_dr
 
     @property

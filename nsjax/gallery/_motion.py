@@ -2,11 +2,11 @@
 
 from typing import NamedTuple
 
-from jaxtyping import Array, Float
+from .._types import Number
 
 
 class Motion(NamedTuple):
     """Displacement and velocity of one mass."""
 
-    x: Float[Array, ""]  # displacement [m]
-    v: Float[Array, ""]  # velocity [m/s]
+    x: Number  # displacement [m]
+    v: Number  # velocity [m/s]

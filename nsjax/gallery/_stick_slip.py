@@ -3,7 +3,7 @@
 from jaxtyping import Array, Float
 
 from .._system import sgn, SwitchValues, System
-from .._types import Scalar
+from .._types import Number, Scalar
 from ._friction import falling
 from ._motion import Motion
 
@@ -28,7 +28,7 @@ class FallingStickSlip(System):
         return Motion(y.v, (-self.k * y.x - friction) / self.m)
 
     @sgn
-    def belt(self, t: Scalar, y: Motion) -> Scalar:
+    def belt(self, t: Scalar, y: Motion) -> Number:
         return y.v - self.v_dr
 
 
@@ -55,7 +55,7 @@ class StickSlip(System):
         return Motion(y.v, (-self.k * y.x - self.c * y.v - self.F_slip * s.belt) / self.m)
 
     @sgn
-    def belt(self, t: Scalar, y: Motion) -> Scalar:
+    def belt(self, t: Scalar, y: Motion) -> Number:
         return y.v - self.v_dr
 
     @belt.breakaway

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._system import sgn, SwitchValues, System
-from .._types import Scalar
+from .._types import Number, Scalar
 from ._motion import Motion
 
 
@@ -34,7 +34,7 @@ class DiscontinuousSupport(System):
         return Motion(y.v, (force - self.k * y.x) / self.m)
 
     @sgn
-    def support(self, t: Scalar, y: Motion) -> tuple[Scalar, Scalar]:
+    def support(self, t: Scalar, y: Motion) -> tuple[Number, Number]:
         penetration = y.x - self.x_c
         return penetration, self.k_f * penetration + self.c_f * y.v
 
@@ -71,16 +71,16 @@ class Trilinear(System):
         force = self.f_0 * jnp.sin(self.omega * t) + contact
         return Motion(y.v, (force - self.c * y.v - self.k * y.x) / self.m)
 
-    def _penetration(self, x: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
+    def _penetration(self, x: Scalar, v: Scalar) -> tuple[Number, Number]:
         """Penetration of a support and its contact force, (6.17); contact where both are positive."""
         return x - self.x_c, self.k_f * (x - self.x_c) + self.c_f * v
 
     @sgn
-    def lower(self, t: Scalar, y: Motion) -> tuple[Scalar, Scalar]:
+    def lower(self, t: Scalar, y: Motion) -> tuple[Number, Number]:
         return self._penetration(y.x, y.v)
 
     @sgn
-    def upper(self, t: Scalar, y: Motion) -> tuple[Scalar, Scalar]:
+    def upper(self, t: Scalar, y: Motion) -> tuple[Number, Number]:
         return self._penetration(-y.x, -y.v)
 
     @property

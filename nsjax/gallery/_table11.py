@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._system import impact, sgn, SwitchValues, System
-from .._types import Scalar
+from .._types import Number, Scalar
 from ._motion import Motion
 
 
@@ -27,7 +27,7 @@ class ElasticSupport(System):
         return Motion(y.v, (self.f_0 * jnp.cos(self.omega * t) - self.k * y.x - support) / self.m)
 
     @sgn
-    def support(self, t: Scalar, y: Motion) -> Scalar:
+    def support(self, t: Scalar, y: Motion) -> Number:
         return y.x
 
     @property
@@ -53,7 +53,7 @@ class DryFriction(System):
         return Motion(y.v, (self.f_0 * jnp.cos(self.omega * t) - self.k * y.x - self.mu * s.friction) / self.m)
 
     @sgn
-    def friction(self, t: Scalar, y: Motion) -> Scalar:
+    def friction(self, t: Scalar, y: Motion) -> Number:
         return y.v
 
     @property
@@ -78,7 +78,7 @@ class BouncingBall(System):
         return Motion(y.v, -self.g + s.floor / self.m)
 
     @impact
-    def floor(self, t: Scalar, y: Motion) -> Scalar:
+    def floor(self, t: Scalar, y: Motion) -> Number:
         return y.x
 
     @floor.restitution
