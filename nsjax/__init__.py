@@ -41,19 +41,13 @@ from ._poincare import (
 )
 from ._reduced_map import reduced_map as reduced_map, ReducedIterate as ReducedIterate
 from ._regularise import banded as banded, smoothed as smoothed
+from ._results import is_okay as is_okay, RESULTS as RESULTS, SolveError as SolveError
 from ._saltation import (
     saltation_matrices as saltation_matrices,
     saltation_matrix as saltation_matrix,
 )
 from ._sensitivity import Sensitivity as Sensitivity, sensitivity as sensitivity
-from ._solution import (
-    Event as Event,
-    Events as Events,
-    is_okay as is_okay,
-    Itinerary as Itinerary,
-    RESULTS as RESULTS,
-    Solution as Solution,
-)
+from ._solution import Event as Event, Events as Events, Itinerary as Itinerary, Solution as Solution
 from ._solve import solve as solve
 from ._sweep import sweep as sweep
 from ._system import (

@@ -41,7 +41,8 @@ from ._find_orbit import find_orbit
 from ._orbit import Orbit
 from ._orbit_branch import OrbitBranch
 from ._parameter import get_parameter, parameter_path
-from ._solution import is_okay, RESULTS, Solution
+from ._results import is_okay, RESULTS
+from ._solution import Solution
 from ._solve import solve
 
 

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, Int
 
 from ._filippov import Model, State
 from ._jacobian import dense_jacobian
+from ._results import is_okay
 from ._saltation import states
-from ._solution import is_okay
 from ._solve import solve
 from ._system import System
 from ._types import Scalar, Y

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._check import check_solve
+from ._arguments import check_solve
 from ._orbit import ravel
 from ._parameter import parameter_path, put_parameter
 from ._poincare import Iterate, phase_map, PoincareMap, positive, Section, section_map
-from ._solution import RESULTS
+from ._results import RESULTS
 from ._sweep import sweep
 from ._system import arrays_of, System
 from ._types import Scalar, Y

@@ -1,22 +1,19 @@
-"""Mistakes in a model or in the arguments of `solve`, found before anything is integrated."""
+"""Mistakes in a model, found before anything is integrated."""
 
-from collections.abc import Mapping, Sequence
+import dataclasses
 from functools import partial
 from typing import Any
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from diffrax._root_finder import use_stepsize_tol
 from jax.core import Tracer
+from jaxtyping import Array, Bool
 
-from ._exponential import Exponential
 from ._filippov import Model, State
-from ._save import in_order
 from ._structure import is_affine, is_constant
-from ._system import clock, impact, relay, sgn, System
+from ._system import AbstractSwitch, clock, impact, relay, sgn, System
 from ._types import Scalar, Y
 
 
@@ -30,153 +27,45 @@ def check_system(system: Any) -> None:
         raise TypeError(f"Argument `system` must be an instance of `nsjax.System`, but got {system!r}.{hint}")
 
 
-def check_solve(
-    system: System,
-    t0: Any,
-    t1: Any,
-    y0: Y,
-    mode: Any,
-    solver: Any,
-    controller: Any,
-    saveat: Any,
-    max_steps: Any,
-    max_events: Any,
-    adjoint: Any,
-) -> tuple[Y, Scalar, Scalar, Any, dfx.AbstractStepSizeController, dict[str, Any]]:
-    """Converts and checks the arguments of `solve`."""
-    check_system(system)
-    if not isinstance(solver, dfx.AbstractSolver):
-        raise TypeError(f"Argument `solver` must be a diffrax solver such as `diffrax.Tsit5()`, but got {solver!r}.")
-    leaves = jax.tree.leaves(y0)
-    if not leaves:
-        raise ValueError("Argument `y0` must hold at least one number, but it is empty.")
-    for leaf in leaves:
-        kind = jnp.result_type(leaf)
-        if jnp.issubdtype(kind, jnp.complexfloating):
-            raise TypeError(
-                "Argument `y0` must be real, but has a complex leaf; split it into real and imaginary part."
-            )
-        if not isinstance(leaf, (float, int)) and not jnp.issubdtype(kind, jnp.floating):
-            raise TypeError(f"Argument `y0` must be of floating point dtype, but has a leaf of dtype {kind}.")
-        if isinstance(leaf, (bool, int)):
-            raise TypeError(
-                f"Argument `y0` must hold floating point numbers, but has the integer {leaf!r}; write {leaf}.0."
-            )
-    dtype = jnp.result_type(*leaves)
-    dtype = jnp.result_type(float) if all(isinstance(x, float) for x in leaves) else dtype
-    y0 = jax.tree.map(lambda x: jnp.asarray(x, dtype), y0)
-    t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
-    for name, t in (("t0", t0), ("t1", t1)):
-        if t.shape != ():
-            raise ValueError(f"Argument `{name}` must be a scalar, but has shape {t.shape}; use `jax.vmap` for many.")
-    for name, value in (("max_steps", max_steps), ("max_events", max_events)):
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"Argument `{name}` must be a positive integer, but got {value!r}.")
-    if not isinstance(saveat, dfx.SaveAt) or not (
-        isinstance(saveat.subs, dfx.SubSaveAt) or (saveat.dense and saveat.subs is None)
-    ):
-        raise ValueError(f"Argument `saveat` must be a `diffrax.SaveAt` without nested `subs`, but got {saveat!r}.")
-    for name in ("solver_state", "controller_state", "made_jump"):
-        if getattr(saveat, name):
-            raise ValueError(f"Argument `saveat` must not ask for `{name}`, which a flow with events does not have.")
-    _check_times(saveat, t0, t1)
-    check_direction(system, t1 < t0)
-    if isinstance(solver, Exponential) and isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
-        raise ValueError(
-            "Argument `adjoint` must not be `RecursiveCheckpointAdjoint` for `Exponential`, whose matrix exponential "
-            "is a loop of unknown length; use `diffrax.DirectAdjoint()`."
-        )
-    controller = _controller(controller, dtype)
-    return y0, t0, t1, _implicit(solver, controller, adjoint), controller, _given(system, mode)
-
-
-def _check_times(saveat: dfx.SaveAt, t0: Scalar, t1: Scalar) -> None:
-    """Checks the times at which the solution is to be saved, where all of them are known (else `_integrate` does)."""
-    ts = getattr(saveat.subs, "ts", None)
-    if ts is None or any(isinstance(t, Tracer) for t in (ts, t0, t1)):
+def check_parameters(system: System) -> None:
+    """Checks the parameters, and what the switches make of them, where they are known."""
+    owner = type(system).__name__
+    for field in dataclasses.fields(system):
+        value = getattr(system, field.name)
+        if isinstance(value, System):
+            check_parameters(value)
+        if isinstance(value, str) or (value is None and field.type in (float, "float")):
+            raise TypeError(f"Parameter `{field.name}` of `{owner}` must be a number, but is {value!r}.")
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves(system)):
         return
-    times = np.asarray(ts, t0.dtype)
-    if times.ndim != 1:
-        raise ValueError(f"Argument `saveat` must have a vector of times `ts`, but its shape is {times.shape}.")
-    if len(times) and not in_order(times, np.asarray(t0), np.asarray(t1)):
-        bad = times[~np.isfinite(times)] if not np.isfinite(times).all() else times[(times - t0) * (times - t1) > 0]
-        got = f"{bad[0]}" if len(bad) else "times in another order; sort them, `jnp.sort(ts)`"
-        raise ValueError(
-            f"Argument `saveat` must have times `ts` that follow one another from t0 = {float(t0):.10g} to t1 = "
-            f"{float(t1):.10g}, but got {got}."
-        )
+    for path, x in jax.tree_util.tree_leaves_with_path(system):
+        if eqx.is_inexact_array_like(x) and np.isnan(np.asarray(x)).any():
+            name = jax.tree_util.keystr(path, simple=True, separator=".")
+            raise ValueError(f"Parameter `{name}` of `{owner}` must be a number, but is NaN.")
+    for switch in system.switches:
+        for part, law, good, value in laws(system, switch):
+            if not np.all(np.asarray(good)):
+                got = np.asarray(value)
+                raise ValueError(
+                    f"`{owner}.{switch.name}{part}` must be {law}, but is {got if got.ndim else float(got)}."
+                )
 
 
-def _implicit(solver: Any, controller: Any, adjoint: Any) -> Any:
-    """Gives an implicit solver's root finder the tolerances of the step size controller, and the solver a kind of loop
-    that can be differentiated, as diffrax does."""
-    if not isinstance(solver, dfx.AbstractImplicitSolver):
-        return solver
-    open_ = [n for n in ("rtol", "atol", "norm") if getattr(solver.root_finder, n) is use_stepsize_tol]
-    if open_ and not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
-        raise ValueError(
-            "Argument `stepsize_controller` must be adaptive for an implicit solver whose root finder has no "
-            "tolerances, but got a fixed one. Use `diffrax.PIDController(rtol=..., atol=...)`, or pass "
-            "`root_finder=diffrax.VeryChord(rtol=..., atol=..., norm=optimistix.max_norm)` to the solver."
-        )
-    if getattr(solver, "scan_kind", "") is None and not isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
-        solver = eqx.tree_at(lambda s: s.scan_kind, solver, "lax", is_leaf=lambda x: x is None)
-    return eqx.tree_at(
-        lambda s: [getattr(s.root_finder, n) for n in open_], solver, [getattr(controller, n) for n in open_]
-    )
-
-
-def _controller(controller: Any, dtype: Any) -> dfx.AbstractStepSizeController:
-    eps = float(jnp.finfo(dtype).eps)
-    if controller is None:
-        tol = 1e-8 if eps < 1e-10 else 1e-5
-        return dfx.PIDController(rtol=tol, atol=tol)
-    if not isinstance(controller, dfx.AbstractStepSizeController):
-        raise TypeError(
-            "Argument `stepsize_controller` must be a diffrax step size controller, such as "
-            f"`diffrax.PIDController(rtol=1e-8, atol=1e-8)`, but got {controller!r}."
-        )
-    rtol = getattr(controller, "rtol", None)
-    # A step of size one is rounded by about eps; its error estimate by a few times that. (Inside `jit` the
-    # tolerance may have no value yet.)
-    least = 8 * eps
-    known = eqx.is_array_like(rtol) and not isinstance(rtol, Tracer)
-    if known and 0 < float(rtol) < least:
-        cure = (
-            "Call `jax.config.update('jax_enable_x64', True)` and pass float64 values, or loosen the tolerance."
-            if eps > 1e-10
-            else "Loosen the tolerance."
-        )
-        raise ValueError(
-            f"Argument `stepsize_controller` must have a tolerance that {dtype} can hold (rtol >= {least:.1e}), but "
-            f"got rtol = {float(rtol):.1e}. {cure}"
-        )
-    return controller
-
-
-def _given(system: System, mode: Any) -> dict[str, Any]:
-    switches = {k.name: k for k in system.switches}
-    if mode is None:
-        return {}
-    if not isinstance(mode, Mapping):
-        single = not isinstance(mode, Sequence) and jnp.ndim(mode) == 0
-        values = [mode] if single else list(mode)
-        if len(values) != len(switches):
-            raise ValueError(
-                f"Argument `mode` must have one value for each of the {len(switches)} switches "
-                f"({', '.join(switches)}), but got {len(values)}."
-            )
-        mode = dict(zip(switches, values))
-    for name, value in mode.items():
-        if name not in switches:
-            known = ", ".join(f"`{n}`" for n in switches) or "none"
-            raise ValueError(f"Argument `mode` must name switches of the system, but got `{name}`; they are: {known}.")
-        allowed = (-1, 0, 1) if isinstance(switches[name], sgn) else (0, 1)
-        if isinstance(switches[name], clock):
-            continue
-        if isinstance(value, int) and value not in allowed:
-            raise ValueError(f"Argument `mode` must give `{name}` one of {allowed}, but got {value}.")
-    return {n: jnp.asarray(v, jnp.int32) for n, v in mode.items()}
+def laws(system: System, switch: AbstractSwitch) -> list[tuple[str, str, Any, Any]]:
+    """What must hold for the numbers of a switch: the name of its method, the law, whether it holds, the number."""
+    if isinstance(switch, sgn) and switch.breakaway_fn is not None:
+        b = jnp.asarray(switch.bound(system))
+        least = 1 - 64 * float(jnp.finfo(jnp.result_type(b, 0.0)).eps)  # a quotient of equal forces may be rounded
+        return [(".breakaway", "at least 1, as friction at rest is no weaker than in slip", b >= least, b)]
+    if isinstance(switch, impact) and switch.restitution_fn is not None:
+        e = jnp.asarray(switch.restitution_fn(system))
+        return [(".restitution", "a number from 0 to 1", (e >= 0) & (e <= 1), e)]
+    if isinstance(switch, clock):
+        ticks = jnp.asarray(switch.guard(system))
+        if ticks.ndim == 0:
+            return [("", "a time above zero", ticks > 0, ticks)]
+        return [("", "a vector of increasing times", jnp.all(ticks[1:] > ticks[:-1]), ticks)]
+    return []
 
 
 def check_model(system: System, t: Scalar, y: Y, direction: Scalar) -> Scalar:
@@ -342,21 +231,12 @@ def check_autonomous(system: System, t: Scalar, y: Y) -> None:
         )
 
 
-def check_contacts(model: Model, t: Scalar, y: Y) -> Scalar:
-    """Checks that every contact force opens its gap, which depends on numbers.
-
-    **Returns:** the time `t`, to be used so that the error is raised.
-    """
+def closing_contacts(model: Model, t: Scalar, y: Y) -> dict[int, Bool[Array, ""]]:
+    """Of each contact force whether it closes its gap, which it must not."""
     zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
     free = State((), (None,) * len(zeros), ())
+    found = {}
     for k in model.contacts:
         unit = tuple(jnp.where(i == k, 1, zero) for i, zero in enumerate(zeros))
-        force = model.rates((k,), t, y, free, unit)[0] - model.rates((k,), t, y, free, zeros)[0]
-        name = model.switches[k].name
-        t = eqx.error_if(
-            t,
-            force < 0,
-            f"`{type(model.system).__name__}.vector_field` must contain `s.{name}` with the sign with which a contact "
-            f"force s.{name} >= 0 opens the gap `{name}`, but it closes it. Change its sign.",
-        )
-    return t
+        found[k] = model.rates((k,), t, y, free, unit)[0] < model.rates((k,), t, y, free, zeros)[0]
+    return found

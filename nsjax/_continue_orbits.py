@@ -19,7 +19,7 @@ from ._orbit_curve import OrbitCurve
 from ._orbit_lane import EACH, ENDED, follow_lane, Lane, lane_tests, LOST, NO_ORBIT
 from ._orbit_start import check_precision, curve_and_start, options, order_of, phase_of
 from ._parameter import get_parameter, parameter_path, put_parameter
-from ._solution import is_okay
+from ._results import is_okay
 from ._sweep import sweep
 from ._system import arrays_of, System
 from ._test_function import BRANCH, PASSED, Test

@@ -13,8 +13,9 @@ from jaxtyping import Array, Bool, Float, Int
 from ._arcs import model_of, Smooth
 from ._filippov import Model, State
 from ._guess import base_point
+from ._results import is_okay
 from ._saltation import landed, states
-from ._solution import is_okay, Solution
+from ._solution import Solution
 from ._solve import solve
 from ._system import System
 from ._types import Scalar, Y

@@ -7,18 +7,20 @@ import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ._filippov import Model, State
 from ._floquet import eigenvalues
 from ._implicit import find_root
 from ._orbit import ravel
-from ._solution import RESULTS
+from ._results import RESULTS
 from ._system import frozen, impact, relay, System
+from ._text import Shown
 from ._types import Scalar, StateT, Y
 
 
-class Equilibrium(eqx.Module, Generic[StateT]):
+class Equilibrium(Shown, Generic[StateT]):
     """A state that does not change.
 
     **Attributes:**
@@ -56,6 +58,13 @@ class Equilibrium(eqx.Module, Generic[StateT]):
     result: RESULTS
 
     def __str__(self) -> str:
+        if jnp.ndim(self.result._value):
+            found = np.asarray(self.result == RESULTS.successful)
+            stable = np.asarray(self.stable)[found]
+            return (
+                f"{found.size} searches for equilibria of {type(self.system).__name__}: {found.sum()} found, "
+                f"{stable.sum()} stable, {(~stable).sum()} unstable"
+            )
         names = [k.name for k in self.system.switches]
         where = ", ".join(f"{n} {int(m):+d}" for n, m in zip(names, self.mode)) or "no switches"
         values = ", ".join(f"{n} {float(v):.6g}" for n, v in zip(names, self.multipliers)) or "none"

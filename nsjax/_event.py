@@ -13,8 +13,8 @@ from ._crossing import bend, deflate, first_root, largest
 from ._filippov import Model, State
 from ._linear import linear_solve
 from ._once import once
+from ._results import RESULTS
 from ._settle import settle
-from ._solution import RESULTS
 from ._step import stack, Stepper
 from ._structure import is_constant
 from ._system import clock, frozen, impact, relay, sgn

@@ -10,11 +10,11 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from ._check import check_solve
+from ._arguments import check_solve
 from ._equilibrium import Equilibrium, equilibrium_in
 from ._filippov import Model
 from ._orbit import ravel
-from ._solution import raise_if, RESULTS
+from ._results import raise_if, RESULTS
 from ._structure import is_constant
 from ._system import arrays_of, clock, impact, sgn, System
 from ._types import StateT, Y

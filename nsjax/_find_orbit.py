@@ -10,15 +10,18 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from ._check import check_autonomous, check_direction, check_solve
+from ._arguments import check_solve
+from ._check import check_autonomous, check_direction
 from ._cuts import Segment
 from ._forward import forward_only
 from ._jacobian import dense_jacobian
 from ._orbit import Orbit, ravel
+from ._results import is_okay, raise_if, RESULTS, SolveError
 from ._search import Search
-from ._solution import is_okay, raise_if
+from ._solve import HINTS
 from ._sweep import sweep
 from ._system import arrays_of, System
+from ._text import known, suggesting, written
 from ._types import StateT, Y
 
 
@@ -26,6 +29,7 @@ def _inversion(y: Y) -> Y:
     return jax.tree.map(jnp.negative, y)
 
 
+@suggesting(HINTS | {"T": "Write `period=...`."})
 def find_orbit(
     system: System,
     y0: StateT,
@@ -153,9 +157,10 @@ def find_orbit(
             "`jax.linearize`), which needs `adjoint=diffrax.DirectAdjoint()`. Or use `jax.jacfwd`.",
         )
         orbit = search.run(system, y0, period)
-    if throw:
-        orbit = raise_if(~is_okay(orbit.result), orbit.result, orbit)
-    return orbit
+    if throw and known(orbit) and not is_okay(orbit.result):
+        last = f"t = {float(orbit.t0):.6g}, {written(orbit.y0)}, period {float(orbit.period):.6g}"
+        raise SolveError(f"{RESULTS[orbit.result]} (The search ended at {last}.)")
+    return raise_if(~is_okay(orbit.result), orbit.result, orbit) if throw else orbit
 
 
 def find_orbits(

@@ -18,8 +18,8 @@ from ._compact import compact_cond
 from ._event import land, Landing
 from ._filippov import BEYOND, Model, State
 from ._once import once
+from ._results import RESULTS
 from ._save import Log, Saved
-from ._solution import RESULTS
 from ._step import stack, Step, Stepper, unresolved, Watch
 from ._system import frozen, impact
 from ._types import Scalar, Y
@@ -117,7 +117,8 @@ class Flow(eqx.Module):
             poor = ~step.resolved | _backward(step, known)
             poor, last = poor & keep & is_finite, (halvings >= 30) | (t_next - c.t <= floor)
             if any(self.jumpy):
-                result = RESULTS.where(poor & last & self.leaps(model, c, step), RESULTS.jump_in_time, result)
+                leaps = poor & last & self.leaps(model, c, step)
+                result, keep = RESULTS.where(leaps, RESULTS.jump_in_time, result), keep & ~leaps
             poor = poor & ~last
             halvings = jnp.where(poor, halvings + 1, jnp.where(keep, 0, halvings))
             keep = keep & ~poor

@@ -9,7 +9,7 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._check import check_solve
+from ._arguments import check_solve
 from ._filippov import Model
 from ._parameter import get_parameter, parameter_path, put_parameter
 from ._system import arrays_of, sgn, System

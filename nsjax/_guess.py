@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._filippov import Model
 from ._orbit import distance, ravel
+from ._results import is_okay, RESULTS
 from ._saltation import states
-from ._solution import is_okay, RESULTS
 from ._solve import solve
 from ._system import clock, relay, sgn, System
 from ._types import Scalar, Y

@@ -14,7 +14,7 @@ from ._find_equilibrium import find_equilibrium
 from ._find_orbit import distinct_orbits, find_orbit
 from ._orbit import Orbit, ravel
 from ._parameter import parameter_path, put_parameter
-from ._solution import is_okay
+from ._results import is_okay
 from ._system import arrays_of, System
 
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._check import check_solve
+from ._arguments import check_solve
 from ._series import _CALLS
 from ._structure import is_affine, is_constant
 from ._system import AbstractSwitch, arrays_of, forwarded, sgn, SwitchValues, System

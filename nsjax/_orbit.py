@@ -13,14 +13,16 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from ._arcs import Arcs, model_of, Path, path_of, SAMPLES
 from ._extremum import largest
 from ._floquet import trivial
+from ._results import is_okay, RESULTS
 from ._saltation import saltation_matrices, states
-from ._solution import Events, Itinerary, RESULTS, Solution
+from ._solution import Events, Itinerary, Solution
 from ._solve import solve
 from ._system import System
+from ._text import between, Shown
 from ._types import Number, Scalar, StateT, Y
 
 
-class Orbit(eqx.Module, Generic[StateT]):
+class Orbit(Shown, Generic[StateT]):
     """A periodic solution.
 
     **Attributes:**
@@ -141,6 +143,13 @@ class Orbit(eqx.Module, Generic[StateT]):
         return solve(self.system, self.t0, end, self.y0, mode=mode, saveat=saveat, **(dict(self.options) | kwargs))
 
     def __str__(self) -> str:
+        if jnp.ndim(self.period):
+            good = np.asarray(is_okay(self.result))
+            stable = np.asarray(self.stable)[good]
+            return (
+                f"{good.size} searches for periodic orbits of {type(self.system).__name__}: {good.sum()} found\n"
+                f"  {stable.sum()} stable, {(~stable).sum()} unstable, periods {between(np.asarray(self.period)[good])}"
+            )
         state = ", ".join(f"{x:.12g}" for x in ravel(self.y0))
         multipliers = ", ".join(f"{complex(m):.6g}" for m in self.multipliers)
         text = (

@@ -15,8 +15,8 @@ from ._course import Start, starts_of
 from ._orbit import Orbit
 from ._orbit_curve import guard_sizes, OrbitCurve
 from ._parameter import get_parameter, parameter_path
+from ._results import is_okay
 from ._segment_flow import exactness, fits, NEVER
-from ._solution import is_okay
 from ._system import arrays_of, System
 from ._types import Y
 

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ._system import System
+from ._text import did_you_mean
 
 
 Path = tuple[str, ...] | tuple[tuple[str, ...], ...]  # of one parameter, or of several
@@ -28,7 +29,8 @@ def parameter_path(system: System, name: Any) -> tuple[str, ...]:
     found = found or [path for path in known if path[-1] == name]
     names = ", ".join(".".join(path) for path in known) or "none"
     if not found:
-        raise ValueError(f"Argument `parameter` must be one of {names}, the parameters of `{owner}`, but got {name!r}.")
+        text = f"Argument `parameter` must be one of {names}, the parameters of `{owner}`, but got {name!r}."
+        raise ValueError(text + did_you_mean(name, [".".join(path) for path in known]))
     if len(found) > 1:
         many = ", ".join(".".join(path) for path in found)
         raise ValueError(f"Argument `parameter` must name one of {many}, but {name!r} may mean any of them.")

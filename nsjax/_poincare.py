@@ -17,9 +17,10 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ._check import check_model, check_solve, check_system
+from ._arguments import check_solve
+from ._check import check_model, check_system
 from ._filippov import Model, State
-from ._solution import is_okay, raise_if, RESULTS
+from ._results import is_okay, raise_if, RESULTS
 from ._solve import solve
 from ._start import AT_ONCE, start_mode
 from ._system import AbstractSwitch, arrays_of, clock, forwarded, frozen, impact, relay, sgn, SwitchValues, System

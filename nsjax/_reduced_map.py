@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ._check import check_solve
+from ._arguments import check_solve
 from ._implicit import find_root
 from ._poincare import phase_map, unless_failed
-from ._solution import is_okay, raise_if, RESULTS
+from ._results import is_okay, raise_if, RESULTS
 from ._solve import solve
 from ._system import arrays_of, System
 from ._types import Scalar, Y

@@ -18,8 +18,9 @@ from ._cycles import CornerMap
 from ._orbit_curve import OrbitCurve
 from ._orbit_trace import midpoint
 from ._parameter import put_parameter
+from ._results import is_okay
 from ._segment_flow import with_parameter
-from ._solution import Events, is_okay
+from ._solution import Events
 from ._solve import solve
 
 

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from ._cuts import cuts_from, cuts_near, Segment
 from ._guess import repeats, settle_down
 from ._orbit import Orbit
+from ._results import is_okay, RESULTS
 from ._segments import by_segments
 from ._shooting import shoot
-from ._solution import is_okay, RESULTS
 from ._system import frozen, System
 from ._types import Scalar, Y
 

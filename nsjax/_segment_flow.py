@@ -18,7 +18,7 @@ from ._arcs import Smooth
 from ._exponential import affine_parts, expm, generator
 from ._filippov import Model, State
 from ._parameter import Path, put_parameter
-from ._solution import is_okay
+from ._results import is_okay
 from ._solve import solve
 from ._system import System
 from ._types import Scalar, Y

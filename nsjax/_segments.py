@@ -20,8 +20,9 @@ from ._filippov import Model, State
 from ._floquet import floquet, forwards, structural_zeros
 from ._implicit import find_root
 from ._orbit import fractions, judge, Orbit, ravel
+from ._results import is_okay, RESULTS
 from ._saltation import fired, saltation_matrices
-from ._solution import Events, is_okay, RESULTS
+from ._solution import Events
 from ._system import frozen, System
 from ._types import Scalar, Y
 

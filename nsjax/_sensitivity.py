@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
-from ._solution import Itinerary, RESULTS, Solution
+from ._results import RESULTS
+from ._solution import Itinerary, Solution
 
 
 class Sensitivity(eqx.Module):

@@ -17,7 +17,8 @@ from ._floquet import floquet, forwards, structural_zeros
 from ._guess import at_start, base_point
 from ._implicit import find_root
 from ._orbit import distance, fractions, judge, Orbit, ravel
-from ._solution import Events, is_okay, RESULTS
+from ._results import is_okay, RESULTS
+from ._solution import Events
 from ._solve import solve
 from ._system import frozen, relay, System
 from ._types import Scalar, Y

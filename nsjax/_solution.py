@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from typing import Any, Generic, NamedTuple
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,117 +10,11 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from ._results import RESULTS
 from ._step import bernstein
 from ._system import System
+from ._text import between, counted, Shown, written
 from ._types import Scalar, StateT, Y
-
-
-class RESULTS(dfx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """Diffrax's results, and those of nonsmooth flows."""
-
-    tangential_event = (
-        "A surface was met tangentially (grazing): nᵀf⁻ + h_t vanishes there, see `sol.events.transversality`. The "
-        "solution is right, but its derivatives through that event are not defined."
-    )
-    max_events_reached = (
-        "The maximum number of events was reached. Increase `max_events`; if events crowd together, look at "
-        "`sol.events`."
-    )
-    accumulation_reached = (
-        "Impacts accumulated (Zeno): infinitely many in a finite time, on a surface that cannot hold the solution (its "
-        "h is a tuple, or the contact force does not occur in `vector_field`). `sol.t1` and `sol.y1` hold the time "
-        "and the state at the accumulation point."
-    )
-    repulsive_sliding = (
-        "The start lies on a surface that repels (2.25) but can hold the solution too, which is therefore not unique. "
-        "Choose one by `mode={'name': 0}` to stay on the surface, or +1 or -1 to leave it to that side."
-    )
-    ambiguous_event = (
-        "Several switches met their surfaces at one instant, and no combination of sticking and slipping satisfies all "
-        "of their laws (or was found to)."
-    )
-    stuck_in_events = (
-        "Events followed one another without any progress in time: the model chatters. A relay whose two surfaces "
-        "coincide, or a reset that does not leave its surface, does this."
-    )
-    mode_not_affine = (
-        "`nsjax.Exponential` met a mode that it cannot step exactly: its forcing is neither constant, linear or "
-        "quadratic in time, exponential, nor harmonic of one frequency; or it slides or rests where the field that "
-        "does so is not affine in the state. Take `nsjax.Taylor()` or a Runge-Kutta solver."
-    )
-    nonfinite_field = "The vector field or an indicator function returned a value that is not finite (NaN or infinity)."
-    wrong_save_times = (
-        "The times of `SaveAt(ts=...)` must be finite, lie between `t0` and `t1`, and follow one another in the "
-        "direction of the integration."
-    )
-    wrong_mode = "Argument `mode` places the start on one side of a surface, but `y0` lies clearly on the other."
-    start_penetrates = (
-        "The start lies beyond an impact surface: h < 0 there. Put `y0` where h >= 0, or change the sign of h."
-    )
-    wrong_reset = (
-        "A reset left the state on the wrong side of its surface (h < 0), or still approaching it (dh/dt < 0). Check "
-        "the signs in the method decorated with `.reset` (or a coefficient of restitution below 0)."
-    )
-    jump_penetrates = (
-        "At a tick of a clock an impact surface jumped beyond the state: h < 0 from then on. A gap may open at once, "
-        "but cannot close so."
-    )
-    jump_in_time = (
-        "An indicator function jumps where nothing tells of it (`floor`, `%`, `round`, `where` or a table, of the "
-        "time or of the state). Declare the times at which it does as ticks of a `nsjax.clock`; what jumps with the "
-        "state is a switch of its own."
-    )
-    equilibrium_not_found = (
-        "No equilibrium was found: Newton's method did not converge. Start nearer to one, give another `mode`, or "
-        "check that the field vanishes anywhere."
-    )
-    no_return = (
-        "The solution did not come back to the section within `max_time`. Give it more time, check `direction`, or "
-        "start where it does; a solution that comes to rest never returns."
-    )
-    reduced_map_not_found = (
-        "No state with this value of the component was found whose other components are periodic: Newton's method did "
-        "not converge. There may be none; or give another `guess`, such as the state found for a value nearby."
-    )
-    orbit_not_found = (
-        "No periodic orbit was found: Newton's method did not converge. Start nearer to one "
-        "(`y0`, `period`), or check that the system has one."
-    )
-    orbit_not_admissible = (
-        "A periodic orbit was found in the segments given, but it is no solution: it does not keep to the modes of "
-        "these segments. With `throw=False` look at `violation` and `violation_t`; start nearer to one that does."
-    )
-    orbit_is_equilibrium = (
-        "The search for a periodic orbit ended in an equilibrium. Start farther away from it, near the orbit."
-    )
-    orbit_is_multiple_cover = (
-        "The orbit found repeats itself within the period asked for. Divide `period` (or `order`) by the number of "
-        "repetitions."
-    )
-
-
-def raise_if(bad: Bool[Array, ""], result: RESULTS, tree: Any) -> Any:
-    """`tree`, if not `bad`, else an error with the message of `result`. Derivatives raise it too: whoever wants these
-    alone computes nothing else, and would be given what belongs to a solution that failed."""
-    smooth, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(_raise_if((smooth, (bad, result))), rest)
-
-
-@eqx.filter_custom_jvp
-def _raise_if(args: Any) -> Any:
-    tree, (bad, result) = args
-    return result.error_if(tree, bad)
-
-
-@_raise_if.def_jvp
-def _raise_if_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    ((tree, verdict),), ((moves, _),) = primals, tangents
-    return _raise_if((tree, verdict)), _raise_if((moves, verdict)) if jax.tree.leaves(moves) else moves
-
-
-def is_okay(result: RESULTS) -> Bool[Array, ""]:
-    """Whether a solution reached its end: successfully, or through a tangential event."""
-    return (result == RESULTS.successful) | (result == RESULTS.tangential_event)
 
 
 class Event(NamedTuple, Generic[StateT]):
@@ -136,7 +29,7 @@ class Event(NamedTuple, Generic[StateT]):
     transversality: Any
 
 
-class Events(eqx.Module, Generic[StateT]):
+class Events(Shown, Generic[StateT]):
     """The event log, in order of time, padded to `max_events` rows (time infinite, switch -1).
 
     **Attributes:**
@@ -163,7 +56,15 @@ class Events(eqx.Module, Generic[StateT]):
     num: Int[Array, ""]
     names: tuple[str, ...] = eqx.field(static=True)
 
+    def _single(self) -> None:
+        if jnp.ndim(self.num):
+            raise TypeError(
+                f"These are the event logs of a batch of {np.shape(self.num)} solutions, `num` has their lengths: take "
+                "one out, `jax.tree.map(lambda x: x[i], events)`, or use the arrays `t`, `switch`, `mode_after`, ..."
+            )
+
     def __len__(self) -> int:
+        self._single()
         return int(self.num)
 
     def __getitem__(self, i: int) -> Event[StateT]:
@@ -183,6 +84,8 @@ class Events(eqx.Module, Generic[StateT]):
         return (self[i] for i in range(len(self)))
 
     def __str__(self) -> str:
+        if jnp.ndim(self.num):
+            return f"event logs of {self.num.size} solutions, {between(self.num)} events each"
         lines = []
         for e in self:
             changes = [f"{n} {e.mode_before[n]:+d} -> {e.mode_after[n]:+d}" for n in self.names]
@@ -192,7 +95,7 @@ class Events(eqx.Module, Generic[StateT]):
         return "\n".join(lines) or "no events"
 
 
-class Itinerary(eqx.Module):
+class Itinerary(Shown):
     """The modes that a solution passes through, with the switches whose events lead from one to the next.
 
     Iterating yields each mode as a dictionary. (A reset leads from a mode to itself.)
@@ -221,6 +124,8 @@ class Itinerary(eqx.Module):
             yield {n: int(m) for n, m in zip(self.names, row)}
 
     def __str__(self) -> str:
+        if jnp.ndim(self.num):
+            return f"itineraries of {self.num.size} solutions, {between(self.num)} events each"
         return " -> ".join(", ".join(f"{n} {m:+d}" for n, m in row.items()) for row in self)
 
 
@@ -229,7 +134,16 @@ def _clipped(x: Array, low: Any, high: Any) -> Array:
     return x + jax.lax.stop_gradient(jnp.clip(x, low, high) - x)
 
 
-class Solution(eqx.Module, Generic[StateT]):
+def _shortened(text: str, most: int = 8) -> str:
+    """The first and the last lines of many, under each other."""
+    lines = text.splitlines()
+    if len(lines) > most:
+        half = most // 2
+        lines = [*lines[:half], f"... {len(lines) - most} more ...", *lines[-half:]]
+    return "\n          ".join(lines)
+
+
+class Solution(Shown, Generic[StateT]):
     """The solution of a piecewise-smooth system.
 
     **Attributes:**
@@ -263,6 +177,29 @@ class Solution(eqx.Module, Generic[StateT]):
     result: RESULTS
     unique: Bool[Array, ""]
     dense: Any = None  # (end times of steps, control points) in internal time, and its direction
+
+    def __str__(self) -> str:
+        owner, stats, many = type(self.system).__name__, self.stats, jnp.ndim(self.events.num) > 0
+        if many:
+            count = self.events.num.size
+            names = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
+            results = counted(names[int(i)] for i in np.ravel(self.result._value))
+            return (
+                f"{count} solutions of {owner} from t = {between(self.t0)} to {between(self.t1)}\n"
+                f"  result  {results}\n"
+                f"  steps   {between(stats['num_steps'])}, events {between(stats['num_events'])}"
+                + f"\n  {np.sum(~np.asarray(self.unique))} not unique"
+                * (not np.all(self.unique))
+            )
+        modes = ", ".join(f"{n} {int(m):+d}" for n, m in zip(self.events.names, self.mode1))
+        text = (
+            f"solution of {owner} from t = {float(self.t0):.10g} to {float(self.t1):.10g}\n"
+            f"  result  {RESULTS[self.result]}\n"
+            f"  end     {written(self.y1)}" + f"; {modes}" * bool(modes) + "\n"
+            f"  steps   {int(stats['num_steps'])}, of which {int(stats['num_rejected_steps'])} rejected\n"
+            f"  events  {_shortened(str(self.events)) if int(self.events.num) else 'none'}"
+        )
+        return text + "\n  not the only solution: see `unique`" * (not self.unique)
 
     @property
     def itinerary(self) -> Itinerary:

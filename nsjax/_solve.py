@@ -10,21 +10,26 @@ import equinox.internal as eqxi
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int
 
-from ._check import check_contacts, check_model, check_solve
+from ._arguments import check_solve
+from ._check import check_model, closing_contacts, laws
+from ._diagnosis import explain
 from ._exponential import Exponential, ExponentialStepper
 from ._filippov import Model, State
 from ._flow import Carry, finite, Flow
 from ._forward import forward_only
 from ._jacobian import dense_jacobian
+from ._results import is_okay, raise_if, RESULTS, SolveError
 from ._save import in_order, Log, Saved
-from ._solution import Events, is_okay, raise_if, RESULTS, Solution
+from ._solution import Events, Solution
 from ._start import start_mode
 from ._step import RungeKutta, Stepper
 from ._structure import is_affine, may_jump
 from ._system import arrays_of, frozen, System
 from ._taylor import Taylor, TaylorStepper
+from ._text import known, suggesting
 from ._types import Scalar, StateT, Y
 
 
@@ -67,7 +72,6 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
     model = Model(system, direction, start, y0).at(start)
-    start = check_contacts(model, start, y0)
     max_events = max_events if model.slots else 0
     state, forked, result = start_mode(model, start, y0, given, frozen(stop - start))
     stepper = _stepper(solver).made_for(model, state, start, y0)
@@ -106,6 +110,10 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         jumpy=jumpy,
         reverse=reverse,
     )
+    for _, _, good, _ in [law for switch in model.switches for law in laws(system, switch)]:
+        result = RESULTS.where(good, result, RESULTS.wrong_parameter)
+    for closes in closing_contacts(model, start, y0).values():
+        result = RESULTS.where(closes, RESULTS.wrong_contact, result)
     zero = jnp.zeros((), jnp.int32)
     bad = ~finite((y0, f0, start, stop))
     result = RESULTS.where(bad, RESULTS.nonfinite_field, result)
@@ -148,8 +156,9 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     c: Carry = eqx.combine(dynamic, static)
     meter.close(c.meter)
     # After an event at the very end the solution has no time left, but it moves with the difference of the two times.
-    late = jnp.where(c.t == stop, stop - c.t, 0)
-    y1, t_end = jax.tree.map(lambda y, f: y + f * late, c.y, c.f), c.t + late
+    ended = c.t == stop
+    late = jnp.where(ended, stop - c.t, 0)
+    y1, t_end = jax.tree.map(lambda y, f: y + jnp.where(ended, f, 0) * late, c.y, c.f), c.t + late
     result = RESULTS.where(c.grazed & (c.result == RESULTS.successful), RESULTS.tangential_event, c.result)
     saved = c.saved
     if request.t1:
@@ -235,6 +244,18 @@ def _events(model: Model, c: Carry, start: State) -> Events:
     )
 
 
+TOLERANCE = "Tolerances are those of the step size: `stepsize_controller=diffrax.PIDController(rtol=..., atol=...)`."
+HINTS = {name: TOLERANCE for name in ("rtol", "atol", "tol", "rtols", "tolerance")} | {
+    "args": "Parameters are fields of the system.",
+    "event": "Surfaces are switches of the system: `@nsjax.sgn`, `@nsjax.relay`, `@nsjax.impact`.",
+    "dense": "Write `saveat=diffrax.SaveAt(dense=True)`.",
+    "ts": "Write `saveat=diffrax.SaveAt(ts=...)`.",
+    "t_eval": "Write `saveat=diffrax.SaveAt(ts=...)`.",
+    "method": "Write `solver=...`.",
+}
+
+
+@suggesting(HINTS)
 def solve(
     system: System,
     t0: Any,
@@ -299,6 +320,17 @@ def solve(
         [jnp.asarray(getattr(controller, n), t0.dtype) for n in plain],
     )
     if dt0 is not None:
+        if known(dt0) and not np.all(np.asarray(dt0) > 0):
+            raise ValueError(f"Argument `dt0` must be a time above zero, whatever the direction, but got {dt0}.")
         dt0 = jnp.abs(jnp.asarray(dt0, t0.dtype))
-    options = _Options(given, solver, controller, saveat, dt0, max_steps, max_events, adjoint, throw, progress_meter)
-    return _run(system, t0, t1, y0, options)
+    told = throw and known((system, t0, t1, y0, given, controller, saveat, dt0))
+    within = throw and not told  # raised by the compiled program itself
+    options = _Options(given, solver, controller, saveat, dt0, max_steps, max_events, adjoint, within, progress_meter)
+    sol = _run(system, t0, t1, y0, options)
+    if not told:
+        return sol
+    if not known(sol.result):  # numbers that are known, within a function that is being compiled
+        return raise_if(~is_okay(sol.result), sol.result, sol)
+    if not is_okay(sol.result):
+        raise SolveError(explain(system, sol))
+    return sol

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from ._filippov import Model, State
+from ._results import RESULTS
 from ._settle import forks, nearly, settle
-from ._solution import RESULTS
 from ._system import frozen, impact, relay, sgn
 from ._types import Scalar, Y
 

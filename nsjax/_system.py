@@ -8,6 +8,7 @@ method (2.32)).
 import abc
 import dataclasses
 import functools as ft
+import inspect
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Self, TYPE_CHECKING
@@ -17,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ._text import did_you_mean
 from ._types import Guard, Scalar, Y
 
 
@@ -289,6 +291,18 @@ class System(eqx.Module):
     state `y` is any pytree of floating point arrays; a `NamedTuple` of named scalars reads best and is the fastest
     under `vmap`.
     """
+
+    def __new__(cls, *args: Any, **parameters: Any) -> Self:
+        taken = inspect.signature(cls.__init__).parameters
+        if not any(p.kind == p.VAR_KEYWORD for p in taken.values()):
+            for name in parameters:
+                if name not in taken:
+                    names = [n for n in taken if n != "self"]
+                    raise TypeError(
+                        f"`{cls.__name__}` has no parameter `{name}` ({', '.join(names) or 'it has none'})."
+                        + did_you_mean(name, names)
+                    )
+        return super().__new__(cls)
 
     @abc.abstractmethod
     def vector_field(self, t: Scalar, y: Y, s: SwitchValues) -> Y:

@@ -10,10 +10,11 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._check import check_solve
+from ._arguments import check_solve
 from ._filippov import Model, State
+from ._results import raise_if, RESULTS
 from ._saltation import saltation_matrices, states
-from ._solution import raise_if, RESULTS, Solution
+from ._solution import Solution
 from ._solve import solve
 from ._system import arrays_of, System
 from ._types import Scalar, Y

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array
 
 from .._orbit import Orbit
+from .._results import RESULTS
 from .._saltation import saltation_matrices
-from .._solution import Events, RESULTS, Solution
+from .._solution import Events, Solution
 from .._system import System
 from .._types import Y
 from .._version import __version__
