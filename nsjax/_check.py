@@ -43,7 +43,9 @@ def check_parameters(system: System) -> None:
             name = jax.tree_util.keystr(path, simple=True, separator=".")
             raise ValueError(f"Parameter `{name}` of `{owner}` must be a number, but is NaN.")
     for switch in system.switches:
-        for part, law, good, value in laws(system, switch):
+        with jax.ensure_compile_time_eval():  # also within a function that is being compiled
+            found = laws(system, switch)
+        for part, law, good, value in found:
             if not np.all(np.asarray(good)):
                 got = np.asarray(value)
                 raise ValueError(
@@ -229,6 +231,24 @@ def check_autonomous(system: System, t: Scalar, y: Y) -> None:
             f"`{name}` depends on the time t, but has no `period`: add a property `period`, that of its forcing, as "
             "`return 2 * jnp.pi / self.omega`."
         )
+
+
+def check_clocks(system: System) -> None:
+    """Checks, where numbers are known, that the clocks of a forced system tick alike in each of its periods."""
+    for switch in system.switches:
+        if not isinstance(switch, clock) or any(isinstance(x, Tracer) for x in jax.tree.leaves(system)):
+            continue
+        with jax.ensure_compile_time_eval():
+            ticks, period = np.asarray(switch.guard(system)), float(np.asarray(system.period))
+        name = f"`{type(system).__name__}.{switch.name}`"
+        if ticks.ndim:
+            raise ValueError(f"{name} is a list of times, which does not repeat itself: no orbit is periodic.")
+        ratio = period / float(ticks)
+        if abs(ratio - round(ratio)) > 1e-9 * ratio or round(ratio) < 1:
+            raise ValueError(
+                f"The period of `{type(system).__name__}` must be a multiple of that of the clock {name}, but they are "
+                f"{period:.10g} and {float(ticks):.10g}."
+            )
 
 
 def closing_contacts(model: Model, t: Scalar, y: Y) -> dict[int, Bool[Array, ""]]:

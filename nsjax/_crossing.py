@@ -90,6 +90,21 @@ def bend(a: list[Array], u: Scalar) -> Scalar:
     return _horner(c, jnp.where(early, u, 1 - u) / jnp.where(early, 1 - u, u))
 
 
+def at(a: list[Array], u: Array) -> Array:
+    """The values at `u`, one for each row."""
+    u = u.reshape(u.shape + (1,) * (a[0].ndim - u.ndim))
+    n = len(a) - 1
+    return sum((x * u**j * (1 - u) ** (n - j) for j, x in enumerate(a[1:], 1)), a[0] * (1 - u) ** n)
+
+
+def falls(a: list[Array]) -> list[Array]:
+    """The derivative with its sign changed, as a polynomial of the same degree: its first root is a least value."""
+    n = len(a) - 1
+    c = [x / w for x, w in zip(a, binomials(n))]
+    d = [w * (x - y) for w, x, y in zip(binomials(n - 1), c, c[1:])]
+    return [d[0], *[x + y for x, y in zip(d, d[1:])], d[-1]]
+
+
 def no_root(a: list[Array]) -> Bool[Array, "..."]:
     """Whether the maximum over the parts (the last axis) is certainly positive on the whole step."""
     return jnp.any(ft.reduce(jnp.minimum, a) > 0, axis=-1)

@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._crossing import bend, deflate, first_root, largest
+from ._crossing import at, bend, deflate, falls, first_root, largest
 from ._filippov import Model, State
 from ._linear import linear_solve
 from ._once import once
@@ -38,6 +38,7 @@ class Landing(NamedTuple):
     grazes: Bool[Array, ""]  # whether it was so tangential that it has no derivative
     forked: Bool[Array, ""]  # whether another solution goes on from here too
     result: RESULTS
+    margin: Scalar  # how near a guard came to zero without meeting it, as a multiple of what the tolerance makes of it
 
 
 def _step_to(te: Scalar, stepper: Stepper, args: tuple) -> tuple[Y, list[Y]]:
@@ -87,15 +88,22 @@ def locate(
     state: State,
     polynomials: list[Float[Array, "slots parts"]],
     noise: Float[Array, "slots parts"],
-) -> tuple[Bool[Array, ""], Scalar, Y, Int[Array, ""], Int[Array, ""]]:
-    """The earliest event of a step: its time, the state there, the slot and the part of the guard that fires.
+) -> tuple[Bool[Array, ""], Scalar, Y, Int[Array, ""], Int[Array, ""], Scalar]:
+    """The earliest event of a step: its time, the state there, the slot and the part of the guard that fires. If there
+    is none, these of the guard that comes nearest to zero within the step and rises again; and its least value.
 
     The root on the dense output is only where to look: the step is taken again to it, and one Newton step with the true
     field corrects the time, and with it the order of events closer than the dense output can tell. The state follows by
     its Taylor series to second order, so that what remains is of third order in the (small) error of the dense output.
     """
     known = model.stacked(model.known_roots(state), 0)
-    found, root = jax.vmap(first_root)(deflate(polynomials, known))
+    # In the same search where each guard is least: one that comes near to zero, and does not meet it, is told.
+    single = jnp.asarray([slot.switch not in model.clocks and model.parts[slot.switch] == 1 for slot in model.slots])
+    first = jnp.arange(known.shape[1]) == 0
+    lows = [jnp.where(first, x, -1.0) for x in falls(polynomials)]
+    both = [jnp.concatenate(pair) for pair in zip(deflate(polynomials, known), lows)]
+    (found, turns), (root, low) = (jnp.split(x, 2) for x in jax.vmap(first_root)(both))
+    turns = turns & (low > 0) & single & (known[:, 0] == 0)
     args = (model, t, y, f0, state)
     frozen_model, start, y_start, f_start, _ = frozen(args)
 
@@ -112,7 +120,10 @@ def locate(
     root = jnp.where(found, root, jnp.inf)
     earliest = jnp.min(root)
     length = lax.stop_gradient(t_next) - start
-    guess = start + jnp.minimum(earliest, 1) * length
+    met = jnp.any(found)
+    least = jnp.where(turns, at(polynomials, low)[:, 0] / once(largest(polynomials))[:, 0], jnp.inf)
+    nearest = jnp.argmin(least)
+    guess = start + jnp.where(met, jnp.minimum(earliest, 1), jnp.where(turns[nearest], low[nearest], 1)) * length
 
     y_guess = stepper(frozen_model, state, start, guess, y_start, f_start).y1
     f = flow(guess, y_guess)
@@ -129,16 +140,17 @@ def locate(
     # Of events at one instant the first in the order of declaration: as long as no guard has fallen below its rounding.
     blur = jnp.take_along_axis(noise, part[:, None], axis=-1)[:, 0] / jnp.where(rate == 0, 1, jnp.abs(rate))
     latest = jnp.min(jnp.where(found, shift + jnp.where(trusted, blur, 0), jnp.inf))
-    slot = jnp.argmax(found & (shift <= latest)).astype(jnp.int32)
+    slot = jnp.where(met, jnp.argmax(found & (shift <= latest)), nearest).astype(jnp.int32)
+    missed = jnp.where(met | ~turns[nearest], jnp.inf, value[nearest])
     te = jnp.clip(guess + shift[slot], start, start + length)
     dt = te - guess
     bend = jax.jvp(flow, (guess, y_guess), (one, f))[1]
     y_end = jax.tree.map(lambda y, f, b: y + dt * (f + 0.5 * dt * b), y_guess, f, bend)
-    te, y_end = _arrival(te, y_end, stepper, (*args, slot, part[slot], jnp.any(found)))
+    te, y_end = _arrival(te, y_end, stepper, (*args, slot, part[slot], met))
     # At the very start of the step the event is a consequence of the one before: it has the same time and derivative.
     at_once = jnp.isfinite(root[slot]) & (root[slot] <= 0)
     te, y_end = jax.tree.map(lambda a, b: jnp.where(at_once, a, b), (t, y), (te, y_end))
-    return jnp.any(found), te, y_end, slot, part[slot]
+    return met, te, y_end, slot, part[slot], missed
 
 
 def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> tuple[Y, Y]:
@@ -211,6 +223,7 @@ def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> tuple[Y, Y]:
 def land(
     model: Model,
     stepper: Stepper,
+    tolerance: tuple[Any, Any],
     want_points: bool,
     t_start: Scalar,
     t: Scalar,
@@ -222,7 +235,7 @@ def land(
     noise: Float[Array, "slots parts"],
 ) -> Landing:
     """Locates the earliest event of a step and makes the transition there."""
-    found, te, before, slot, part = locate(model, stepper, t, t_next, y, f0, state, polynomials, noise)
+    found, te, before, slot, part, missed = locate(model, stepper, t, t_next, y, f0, state, polynomials, noise)
     ticks = jnp.asarray([k in model.clocks for k, _, _ in model.slots])[slot] if model.clocks else None
     if ticks is not None:  # to the last digit
         te = te + lax.stop_gradient(jnp.where(ticks, model.next_tick(state.mode) - te, 0))
@@ -348,7 +361,7 @@ def land(
         news = news | (state_after.mode[k] != state.mode[k])
         if isinstance(switch, impact):
             news = news | fired[k]
-    cosine = transversality(model, te, before, state, slot, part)
+    cosine, slack = transversality(model, te, before, state, slot, part, tolerance)
     cosine = cosine if ticks is None else jnp.where(ticks, 1, cosine)
     bends = bend([a[slot, part] for a in polynomials], (te - t) / jnp.where(halted, 1, t_next - t)) > 0
     grazes = found & news & ~halted & bends & (cosine < jnp.cbrt(jnp.finfo(te.dtype).eps))
@@ -359,12 +372,29 @@ def land(
         points = stack(stepper.points(y, before, increments))
     f_after = later.flow(t_after, after, state_after)
     return Landing(
-        found, te, t_after, before, after, f_after, state_after, slot, news, points, cosine, grazes, forked, result
+        found,
+        te,
+        t_after,
+        before,
+        after,
+        f_after,
+        state_after,
+        slot,
+        news,
+        points,
+        cosine,
+        grazes,
+        forked,
+        result,
+        missed / slack,
     )
 
 
-def transversality(model: Model, t: Scalar, y: Y, state: State, slot: Int[Array, ""], part: Int[Array, ""]) -> Scalar:
-    """The cosine between the trajectory and the normal of the surface it meets, in time and state."""
+def transversality(
+    model: Model, t: Scalar, y: Y, state: State, slot: Int[Array, ""], part: Int[Array, ""], tolerance: Any
+) -> tuple[Scalar, Scalar]:
+    """The cosine between the trajectory and the normal of the surface it meets, in time and state; and what an error of
+    the state within the tolerance (relative, absolute) makes of h."""
     model, t, y = frozen((model, t, y))
     flat, unravel = jfu.ravel_pytree(y)
 
@@ -372,7 +402,8 @@ def transversality(model: Model, t: Scalar, y: Y, state: State, slot: Int[Array,
         return model.stacked(model.guards(t, unravel(x), state), -1.0)[slot, part]
 
     h_t, n = jax.grad(guard, argnums=(0, 1))(t, flat)
-    return cosine(h_t, n, jfu.ravel_pytree(model.flow(t, y, state))[0])
+    rtol, atol = tolerance
+    return cosine(h_t, n, jfu.ravel_pytree(model.flow(t, y, state))[0]), jnp.abs(n) @ (atol + rtol * jnp.abs(flat))
 
 
 def cosine(h_t: Scalar, n: Float[Array, " n"], f: Float[Array, " n"]) -> Scalar:

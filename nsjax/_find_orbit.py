@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._arguments import check_solve
-from ._check import check_autonomous, check_direction
+from ._check import check_autonomous, check_clocks, check_direction
 from ._cuts import Segment
 from ._forward import forward_only
 from ._jacobian import dense_jacobian
@@ -134,6 +134,8 @@ def find_orbit(
     autonomous = system.period is None
     if autonomous:
         check_autonomous(system, t0, y0)
+    else:
+        check_clocks(system)
     if not autonomous and period is not None:
         raise ValueError("Argument `period` must not be given for a forced system; use `order` for a subharmonic.")
     if autonomous and order not in (1, None):

@@ -44,6 +44,7 @@ class Carry(eqx.Module):
     crawled: Int[Array, ""]  # steps in a row of a few units in the last place of time
     grazed: Bool[Array, ""]  # whether an event was tangential
     forked: Bool[Array, ""]  # whether another solution sets out from the start too, or branches off on the way
+    margin: Scalar  # the nearest that a guard came to zero without meeting it
     log: Log | None
     saved: Saved
     meter: PyTree
@@ -79,6 +80,11 @@ class Flow(eqx.Module):
     jumpy: tuple[bool, ...] = eqx.field(static=True)  # whether each guard holds an operation that may jump
     reverse: bool = eqx.field(static=True)  # whether the loop is to be transposed
 
+    @property
+    def tolerance(self) -> tuple[Any, Any]:
+        """Relative and absolute, of a step; not numbers for steps of a given length."""
+        return getattr(self.controller, "rtol", jnp.nan), getattr(self.controller, "atol", jnp.nan)
+
     def land(
         self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list, noise: list, touches: list
     ) -> Landing:
@@ -87,7 +93,9 @@ class Flow(eqx.Module):
         *first, last = once(self.stepper.scaled(model, lax.stop_gradient(coefficients)))
         polynomials = [*first, jnp.where(model.stacked(touches, False), jnp.minimum(last, 0), last)]
         noises = model.stacked(lax.stop_gradient(noise), 0.0)
-        return land(model, self.stepper, self.want_points, self.t0, t, t_next, y, f, state, polynomials, noises)
+        return land(
+            model, self.stepper, self.tolerance, self.want_points, self.t0, t, t_next, y, f, state, polynomials, noises
+        )
 
     def attempt(self, c: Carry) -> _Attempt:
         """A step of the solver, its error against the tolerance, and whether a guard may have a root on it."""
@@ -216,6 +224,7 @@ class Flow(eqx.Module):
             grazes=no,
             forked=no,
             result=RESULTS.successful,
+            margin=jnp.full_like(t, jnp.inf),
         )
         if not model.slots:
             return end
@@ -224,7 +233,8 @@ class Flow(eqx.Module):
         there = _landed(attempt.busy, self, here, end)
         # A lane that looked for a root may have found none.
         event = attempt.busy & there.found
-        there = jax.tree.map(lambda a, b: jnp.where(event, a, b), there, end)
+        near = jnp.where(attempt.busy, there.margin, jnp.inf)
+        there = jax.tree.map(lambda a, b: jnp.where(event, a, b), there, end)._replace(margin=near)
         roots = list(there.state.roots)
         for k, r in enumerate(roots):
             later = jnp.where(jnp.abs(r) >= BEYOND, jnp.sign(r) * BEYOND, 0) if model.static(k) else 0
@@ -282,6 +292,7 @@ class Flow(eqx.Module):
             crawled=crawled,
             grazed=grazed,
             forked=forked,
+            margin=jnp.minimum(c.margin, jnp.where(c.active, there.margin, jnp.inf)),
             log=log,
             saved=self.save(c, there, moved, accepted),
             meter=self.meter.step(c.meter, jnp.where(active, (t - self.t0) / (self.t1 - self.t0), 1.0)),

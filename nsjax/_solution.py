@@ -160,6 +160,11 @@ class Solution(Shown, Generic[StateT]):
         example 2.5; static friction that holds with |λ| > 1), or it runs backwards and slides or rests. Derivatives are
         those among solutions of the same choice.
 
+    - `margin`: how near it came to an event that did not happen: the least value of an indicator function (or of a
+        multiplier's distance from its bound) that fell and rose again, over what an error of the state by the
+        tolerance of a step makes of it. Up to some tens the itinerary is a matter of the tolerance. Infinite where
+        nothing came near; a surface of several components is not looked at, and NaN for steps of a given length.
+
     With `SaveAt(dense=True)`, `sol(t)` is the state at a time, or at each of an array of times; see `evaluate`.
     """
 
@@ -176,6 +181,7 @@ class Solution(Shown, Generic[StateT]):
     stats: dict[str, Any]
     result: RESULTS
     unique: Bool[Array, ""]
+    margin: Scalar
     dense: Any = None  # (end times of steps, control points) in internal time, and its direction
 
     def __str__(self) -> str:
@@ -199,7 +205,8 @@ class Solution(Shown, Generic[StateT]):
             f"  steps   {int(stats['num_steps'])}, of which {int(stats['num_rejected_steps'])} rejected\n"
             f"  events  {_shortened(str(self.events)) if int(self.events.num) else 'none'}"
         )
-        return text + "\n  not the only solution: see `unique`" * (not self.unique)
+        near = f"\n  margin  {float(self.margin):.2g} tolerances: whether a surface was met is a matter of these"
+        return text + near * bool(self.margin < 100) + "\n  not the only solution: see `unique`" * (not self.unique)
 
     @property
     def itinerary(self) -> Itinerary:

@@ -137,6 +137,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         crawled=zero,
         grazed=jnp.zeros((), bool),
         forked=forked,
+        margin=jnp.full_like(start, jnp.inf),
         log=Log(max_events, y0, len(model.switches)) if model.slots else None,
         saved=saved,
         meter=meter.init(),
@@ -183,6 +184,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         },
         result=result,
         unique=~c.forked,
+        margin=c.margin,
         dense=None if saved.dense is None else (*saved.dense, direction, c.accepted),
     )
     if throw:

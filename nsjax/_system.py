@@ -100,6 +100,9 @@ class sgn(AbstractSwitch):
 class relay(AbstractSwitch):
     """A switch with memory: its value is 0 or 1, with a surface of its own for each change.
 
+    Both surfaces are levels and not edges: a relay that is on while its `off` indicator function is above zero switches
+    off at once, wherever that came from (a start, an impact, a tick of a clock). Where both are above zero it chatters.
+
     ```python
     @nsjax.relay
     def heater(self, t, y):        # switches on where this rises through zero
@@ -290,6 +293,9 @@ class System(eqx.Module):
     or `nsjax.impact`, and `vector_field(t, y, s)` its right-hand side, where `s.name` is the value of a switch. The
     state `y` is any pytree of floating point arrays; a `NamedTuple` of named scalars reads best and is the fastest
     under `vmap`.
+
+    A model into which the time enters periodically says so by a property `period` [time]: orbits, maps and branches
+    are those of that period. Where a function of time jumps, the times are declared by an `nsjax.clock`.
     """
 
     def __new__(cls, *args: Any, **parameters: Any) -> Self:
@@ -323,7 +329,8 @@ class System(eqx.Module):
 
     @property
     def period(self) -> Float[Array, ""] | float | None:
-        """Period of the explicit time dependence; `None` when autonomous."""
+        """Period of the explicit time dependence [time]; `None`, the default, for an autonomous model. To be overridden:
+        `return 2 * jnp.pi / self.omega`."""
         return None
 
     def values(self, s: tuple[Any, ...]) -> SwitchValues:

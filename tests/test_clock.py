@@ -260,6 +260,74 @@ def test_undeclared():
             assert sol.result == RESULTS.jump_in_time
 
 
+def test_periods_of_clocks():
+    """An orbit is sought over periods in which every clock ticks alike."""
+
+    class Slow(Square):
+        @property
+        def period(self):
+            return 1.5 * self.T
+
+    with pytest.raises(
+        ValueError, match="must be a multiple of that of the clock `Slow.rises`, but they are 2.55 and 1.7"
+    ):
+        nsjax.find_orbit(Slow(), Motion(0.1, 0.2))
+
+    class Free(Square):
+        period = None
+
+    with pytest.raises(ValueError, match="has no `period`"):
+        nsjax.find_orbit(Free(), Motion(0.1, 0.2))
+
+
+class Steps(nsjax.System):
+    """Set points from a table, and a wall that opens at a tick."""
+
+    times: Array
+    points: Array
+
+    def vector_field(self, t, y, s):
+        point = self.points[jnp.searchsorted(self.times, t, side="right")]
+        return Motion(y.v, point - y.x - 0.2 * y.v + s.wall)
+
+    @nsjax.clock
+    def changes(self):
+        return self.times
+
+    @nsjax.impact
+    def wall(self, t, y):
+        return y.x - jnp.where(t < self.times[1], 0.0, -1.0)
+
+    @wall.restitution
+    def wall(self):
+        return 0.0
+
+
+def test_table_and_a_wall_that_opens():
+    """A list of ticks; a mass pressed against a wall that is gone from one of them on moves off at once; and a wall that
+    closes upon it is refused."""
+    system = Steps(jnp.asarray([1.0, 2.5]), jnp.asarray([-0.5, -0.5, -0.5]))
+    sol = nsjax.solve(system, 0.0, 4.0, Motion(0.0, 0.0), stepsize_controller=pid(1e-11))
+    assert [(e.switch, e.mode_after["wall"], float(e.t)) for e in sol.events] == [
+        ("changes", 1, 1.0),
+        ("changes", 0, 2.5),
+    ]
+    m = np.array([[0, 1, 0], [-1, -0.2, -0.5], [0, 0, 0]])
+    np.testing.assert_allclose(flat(sol.y1), (expm(m * 1.5) @ [0, 0, 1])[:2], atol=1e-9)
+
+    class Closing(Steps):
+        @nsjax.impact
+        def wall(self, t, y):
+            return y.x - jnp.where(t < self.times[1], -1.0, 0.0)
+
+        @wall.restitution
+        def wall(self):
+            return 0.0
+
+    sol = nsjax.solve(Closing(system.times, system.points), 0.0, 4.0, Motion(-0.5, 0.0), throw=False)
+    assert sol.result == RESULTS.jump_penetrates and sol.t1 == 2.5
+
+
 def test_kinks_are_no_jumps():
     """A surface that is a continuous function of a sawtooth needs no clock (but steps)."""
 

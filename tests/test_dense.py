@@ -126,3 +126,26 @@ def test_forced_orbit_based_on_an_event():
     for t0 in (float(release.t), np.nextafter(float(release.t), 0), float(release.t) + 1e-13):
         orbit = nsjax.find_orbit(system, release.y_after, t0=t0)
         np.testing.assert_allclose(orbit.multipliers, free.multipliers, atol=1e-9)
+
+
+class Near(nsjax.System):
+    """x = -0.3 + cos t beside a wall at -1.3 - gap."""
+
+    gap: float = 1e-3
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - 0.3 * s.wall)
+
+    @nsjax.sgn
+    def wall(self, t, y):
+        return y.x + 1.3 + self.gap
+
+
+def test_margin():
+    """Issue 20.8, pitfall 45: how near the solution came to an event that did not happen, in units of the tolerance."""
+    run = jax.jit(lambda gap: nsjax.solve(Near(gap=gap), 0.0, 10.0, Motion(0.7, 0.0)))
+    for gap in (1e-4, 1e-6, 1e-7):
+        np.testing.assert_allclose(run(gap).margin, gap / (1e-8 * (1 + 1.3)), rtol=0.1)
+    assert run(1e-9).margin < 1 and "tolerances: whether a surface was met" in str(run(1e-9))
+    assert run(1.0).margin == np.inf and "tolerances" not in str(run(1.0))
+    assert len(run(-1e-3).events) == 4 and run(-1e-3).margin > 100

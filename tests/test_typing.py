@@ -15,8 +15,6 @@ import nsjax
 
 ROOT = pathlib.Path(__file__).parents[1]
 MODEL, CALLS = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[:2]
-# A component is written as a float, and comes out as an array.
-MODEL = re.sub(r": Array( +#)", r": Array | float\1", MODEL)
 
 REVEALED = {
     "sol.y1": "State",
