@@ -11,7 +11,7 @@ import numpy as np
 from diffrax._root_finder import use_stepsize_tol
 from jax.core import Tracer
 
-from ._check import check_direction, check_parameters, check_system
+from ._check import check_direction, check_fields, check_parameters, check_system
 from ._exponential import Exponential
 from ._save import in_order
 from ._system import clock, sgn, System
@@ -34,6 +34,7 @@ def check_solve(
 ) -> tuple[Y, Scalar, Scalar, Any, dfx.AbstractStepSizeController, dict[str, Any]]:
     """Converts and checks the arguments of `solve`."""
     check_system(system)
+    check_fields(system)
     if not isinstance(solver, dfx.AbstractSolver):
         raise TypeError(f"Argument `solver` must be a diffrax solver such as `diffrax.Tsit5()`, but got {solver!r}.")
     leaves = jax.tree.leaves(y0, is_leaf=lambda x: x is None)
@@ -60,12 +61,6 @@ def check_solve(
     for name, t in (("t0", t0), ("t1", t1)):
         if t.shape != ():
             raise ValueError(f"Argument `{name}` must be a scalar, but has shape {t.shape}; use `jax.vmap` for many.")
-        if not isinstance(t, Tracer) and not np.isfinite(t):
-            raise ValueError(f"Argument `{name}` must be finite, but is {float(t)}.")
-    for name, value in [] if not known(y0) else components(y0):
-        if not np.isfinite(value):
-            raise ValueError(f"Argument `y0` must be finite, but its component `{name}` is {float(value)}.")
-    check_parameters(system)
     for name, value in (("max_steps", max_steps), ("max_events", max_events)):
         if not isinstance(value, int) or value < 1:
             raise ValueError(f"Argument `{name}` must be a positive integer, but got {value!r}.")
@@ -85,6 +80,17 @@ def check_solve(
         )
     controller = _controller(controller, dtype)
     return y0, t0, t1, _implicit(solver, controller, adjoint), controller, _given(system, mode)
+
+
+def check_numbers(system: System, t0: Scalar, t1: Scalar, y0: Y) -> None:
+    """Checks the numbers that are known, where a failure is to raise: before anything is compiled."""
+    for name, t in (("t0", t0), ("t1", t1)):
+        if not isinstance(t, Tracer) and not np.isfinite(t):
+            raise ValueError(f"Argument `{name}` must be finite, but is {float(t)}.")
+    for name, value in components(y0) if known(y0) else []:
+        if not np.isfinite(value):
+            raise ValueError(f"Argument `y0` must be finite, but its component `{name}` is {float(value)}.")
+    check_parameters(system)
 
 
 def _check_times(saveat: dfx.SaveAt, t0: Scalar, t1: Scalar) -> None:

@@ -27,15 +27,20 @@ def check_system(system: Any) -> None:
         raise TypeError(f"Argument `system` must be an instance of `nsjax.System`, but got {system!r}.{hint}")
 
 
-def check_parameters(system: System) -> None:
-    """Checks the parameters, and what the switches make of them, where they are known."""
-    owner = type(system).__name__
+def check_fields(system: System) -> None:
+    """Checks that parameters declared as numbers are numbers."""
     for field in dataclasses.fields(system):
         value = getattr(system, field.name)
         if isinstance(value, System):
-            check_parameters(value)
-        if isinstance(value, str) or (value is None and field.type in (float, "float")):
+            check_fields(value)
+        if field.type in (float, "float") and (value is None or isinstance(value, str)):
+            owner = type(system).__name__
             raise TypeError(f"Parameter `{field.name}` of `{owner}` must be a number, but is {value!r}.")
+
+
+def check_parameters(system: System) -> None:
+    """Checks the values of the parameters, and what the switches make of them, where they are known."""
+    owner = type(system).__name__
     if any(isinstance(x, Tracer) for x in jax.tree.leaves(system)):
         return
     for path, x in jax.tree_util.tree_leaves_with_path(system):

@@ -10,7 +10,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from ._arguments import check_solve
+from ._arguments import check_numbers, check_solve
 from ._check import check_autonomous, check_clocks, check_direction
 from ._cuts import Segment
 from ._forward import forward_only
@@ -129,6 +129,8 @@ def find_orbit(
     if not isinstance(pieces, int) or not 1 <= pieces <= 64:
         raise ValueError(f"Argument `pieces` must be an integer from 1 to 64, but got {pieces!r}.")
     check_direction(system, backward)
+    if throw:
+        check_numbers(system, t0, t0, y0)
     system = arrays_of(system, t0.dtype)
     how = dict(solver=solver, stepsize_controller=controller, max_steps=max_steps, max_events=max_events)
     autonomous = system.period is None

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from ._arguments import check_solve
+from ._arguments import check_numbers, check_solve
 from ._check import check_model, closing_contacts, laws
 from ._diagnosis import explain
 from ._exponential import Exponential, ExponentialStepper
@@ -313,6 +313,8 @@ def solve(
     y0, t0, t1, solver, controller, given = check_solve(
         system, t0, t1, y0, mode, solver, stepsize_controller, saveat, max_steps, max_events, adjoint
     )
+    if throw:
+        check_numbers(system, t0, t1, y0)
     system = arrays_of(system, t0.dtype)
     # Tolerances are numbers too: a new one is no new program.
     plain = [n for n in ("rtol", "atol") if isinstance(getattr(controller, n, None), (int, float))]

@@ -329,8 +329,8 @@ class System(eqx.Module):
 
     @property
     def period(self) -> Float[Array, ""] | float | None:
-        """Period of the explicit time dependence [time]; `None`, the default, for an autonomous model. To be overridden:
-        `return 2 * jnp.pi / self.omega`."""
+        """Period of the explicit time dependence [time], to be overridden: `return 2 * jnp.pi / self.omega`. `None`,
+        the default, is for an autonomous model."""
         return None
 
     def values(self, s: tuple[Any, ...]) -> SwitchValues:

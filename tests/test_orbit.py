@@ -1,7 +1,6 @@
 """Periodic orbits against closed forms and 40-digit references, and what the search says when there is none."""
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -154,7 +153,7 @@ def test_not_the_orbit_asked_for(parameters, y0, period, result):
     system = gallery.StickSlip(**parameters)
     orbit = find_orbit(system, Motion(*y0), period=period, throw=False, **METHOD)
     assert orbit.result == result
-    with pytest.raises(eqx.EquinoxRuntimeError, match=str(RESULTS[result])[:30]):
+    with pytest.raises(nsjax.SolveError, match=str(RESULTS[result])[:30]):
         find_orbit(system, Motion(*y0), period=period, **METHOD)
 
 
@@ -223,7 +222,7 @@ class Resonator(nsjax.System):
 
 def test_no_orbit_at_all():
     """Nothing returns: x only grows."""
-    with pytest.raises(eqx.EquinoxRuntimeError, match="No periodic orbit was found"):
+    with pytest.raises(nsjax.SolveError, match="No periodic orbit was found"):
         find_orbit(Hopf(rate=0.0, w=0.0, drift=1.0), Plane(1.0, 0.0), period=3.0, **METHOD)
     assert (
         find_orbit(Hopf(rate=0.0, w=0.0, drift=1.0), Plane(1.0, 0.0), throw=False, **METHOD).result
