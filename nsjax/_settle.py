@@ -1,7 +1,7 @@
 """The choice of mode where switches are at their surfaces."""
 
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.lax as lax
@@ -9,12 +9,111 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+from ._attraction import attraction, coinciding, negligible, Pairs, reach
 from ._filippov import Model, State
+from ._linear import nearly
 from ._system import frozen
 from ._types import Scalar, Y
 
 
 _TRIED = 4  # so many switches at their surfaces are settled by trying every assignment
+
+
+class _Look(NamedTuple):
+    """What an assignment leads to, for each switch that may be at its surface."""
+
+    s: dict[int, Scalar]  # its value: a sign, or the multiplier λ
+    rates: dict[int, Scalar]  # dh/dt, of contacts d²h/dt²
+    slopes: dict[int, Scalar]  # what its value adds to that while all others that hold do so, see `attraction`
+    spans: dict[int, Scalar]  # what all `sgn` switches together may add; only of surfaces that may coincide
+
+
+class _Instant(NamedTuple):
+    """Where switches are at their surfaces, and what is known of each of them: see `settle`."""
+
+    model: Model
+    t: Scalar
+    y: Y
+    state: State
+    at: dict[int, Bool[Array, ""]]
+    leaves: dict[int, Int[Array, ""]]
+    given: tuple[int, ...] | None
+    pairs: Pairs
+
+    @property
+    def which(self) -> tuple[int, ...]:
+        return tuple(self.at)
+
+    @property
+    def came(self) -> dict[int, Int[Array, ""]]:
+        return {k: self.state.mode[k] for k in self.at}
+
+    @property
+    def starts(self) -> bool:
+        return self.given is not None
+
+    def dry(self, k: int) -> bool:
+        """Whether it is a `sgn` switch that can hold the solution."""
+        return k in self.model.holdable and k not in self.model.contacts
+
+    def open(self, k: int) -> Bool[Array, ""]:
+        """Whether its mode is to be chosen."""
+        return jnp.zeros((), bool) if k in (self.given or ()) else self.at[k]
+
+    def fresh(self, k: int) -> Bool[Array, ""] | bool:
+        """Whether it comes to its surface only now."""
+        return True if self.starts else self.came[k] != 0
+
+    def values(self, mode: dict[int, Any]) -> tuple[State, tuple]:
+        trial = self.state._replace(mode=tuple(mode.values()))
+        return trial, self.model.values(self.t, self.y, trial)
+
+    def look(self, mode: dict[int, Any]) -> _Look:
+        model, t, y, which = self.model, self.t, self.y, self.which
+        trial, s = self.values(mode)
+        rates = dict(zip(which, model.rates(which, t, y, trial, s)))
+        slopes = {k: jnp.zeros((), t.dtype) for k in which}
+        spans = slopes
+        if model.holdable:
+            _, matrix = model.linear(t, y, trial, s)
+            held = jnp.stack([model.held(k, mode[k]) for k in model.holdable])
+            effects = attraction(matrix, held, self.pairs)
+            slopes = slopes | {
+                k: matrix[i, i] if k in model.contacts else effects[i] for i, k in enumerate(model.holdable)
+            }
+            if self.pairs:
+                spans = spans | dict(zip(model.holdable, reach(model, matrix)))
+        return _Look({k: s[k] for k in which}, rates, slopes, spans)
+
+    def forks(self, k: int, multiplier: Scalar, slope: Scalar) -> Bool[Array, ""]:
+        """Whether `sgn` switch k, at its surface, can hold the solution there (|λ| <= b) and let it go as well: because
+        the surface repels, or because |λ| > 1, so that on both sides the fields point the same way.
+
+        The rule is that a repulsive surface is crossed, and that static friction holds."""
+        size = jnp.abs(multiplier)
+        return (size <= self.model.bound(k)) & ((slope > 0) | (size > 1 + nearly(size)))
+
+    def grips(self, k: int, multiplier: Scalar) -> Bool[Array, ""]:
+        """Whether, running backwards, static friction holds what arrives. It does not where |λ| < 1: there nothing
+        does."""
+        if not self.model.static(k):
+            return jnp.zeros((), bool)
+        size = jnp.abs(multiplier)
+        return (
+            (self.model.direction < 0)
+            & (size > 1 + nearly(size))
+            & (size <= (1 + nearly(size)) * self.model.bound(k))
+        )
+
+    def noise(self, s: dict) -> dict[int, Scalar]:
+        """What rounding can make of d²h/dt² of the contacts: a force below it counts as none, and holds."""
+        model, t, y, state = self.model, self.t, self.y, self.state
+        zero = {k: jnp.zeros((), t.dtype) for k in self.which}
+        if not model.contacts:
+            return zero
+        values = tuple(s.get(k, v) for k, v in enumerate(model.signs(t, state)))
+        blurs = model.rounding(lambda t, y: model.rates(model.contacts, t, y, state, values), t, y)
+        return zero | dict(zip(model.contacts, blurs))
 
 
 def settle(
@@ -24,14 +123,15 @@ def settle(
     state: State,
     at: dict[int, Bool[Array, ""]],
     leaves: dict[int, Int[Array, ""]],
+    given: tuple[int, ...] | None = None,
 ) -> tuple[State, Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
     """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}, every contact one from {1, 0}.
 
-    All of them hold if that is valid (|λ| <= b, a contact force λ >= 0), else as many as can be. Of up to four
-    switches every assignment is tried; of those that hold as many the one that keeps what held before is taken, and if
-    that is not one alone either, the solution is not unique. Of more, the one that
-    violates its law most is released, to the sign of its λ, and a released switch whose motion then opposes this is
-    taken back, until nothing is violated.
+    An assignment is valid if each that holds has |λ| <= b (a contact a force λ >= 0) and each other one moves to its
+    side. Of up to four switches every assignment is tried; of the valid ones those are preferred in which no surface
+    that repels holds what arrives at it, of these the ones that hold most, that keep what held before, and that
+    cross what is met. Of more, all are held that attract, the one that violates its law most is released, to the sign
+    of its λ, and a released switch whose motion then opposes this is taken back, until nothing is violated.
 
     **Arguments:**
 
@@ -39,87 +139,40 @@ def settle(
         and one whose side is unknown has 0.
     - `at`: for each `sgn` switch whether it is at its surface, for each contact whether it rests there (dh/dt = 0).
     - `leaves`: for each switch the sign with which its λ just reached its bound, else 0.
+    - `given`: at the start of a solution the switches that keep the mode they have.
 
-    **Returns:** the new state; whether a side must be chosen (a repulsive surface (2.25) met without one); whether one
-    was chosen by rule, see `forks`; and whether not exactly one assignment was found.
+    **Returns:** the new state; whether a side must be chosen (a start on a repulsive surface (2.25)); whether there is
+    another valid assignment, see `Solution.unique`; and whether not exactly one assignment was found.
     """
     model, t, y = frozen((model, t, y))  # modes have no derivative
     which = tuple(at)
     false = jnp.zeros((), bool)
     if not which:
         return state, false, false, false
+    here = _Instant(model, t, y, state, at, leaves, given, {})
     mode = dict(enumerate(state.mode))
-    came = {k: mode[k] for k in which}
-
-    def look(mode: dict[int, Any]) -> tuple[dict, dict, dict]:
-        trial = state._replace(mode=tuple(mode.values()))
-        s = model.values(t, y, trial)
-        rates = dict(zip(which, model.rates(which, t, y, trial, s)))
-        slopes = {k: jnp.zeros((), t.dtype) for k in which}
-        if model.holdable:
-            _, matrix = model.linear(t, y, trial, s)
-            slopes |= {k: matrix[i, i] for i, k in enumerate(model.holdable)}
-        return {k: s[k] for k in which}, rates, slopes
-
-    # First guess: everything at its surface is held, unless its surface repels or its value does not act on it.
     trial = dict(mode)
     for k in which:
         if k in model.contacts:
             trial[k] = jnp.where(at[k], jnp.where(leaves[k] != 0, 0, 1), mode[k])
         elif k in model.holdable:
             trial[k] = jnp.where(at[k], 0, mode[k])
-    s, rates, slopes = look(trial)
-    noise = _noise(model, t, y, state, which, s)
-    repels = {k: slopes[k] >= 0 for k in which}
-    forked = false
-    for k in which:
-        if k in model.holdable and k not in model.contacts:
-            forked = forked | (at[k] & (came[k] != 0) & (leaves[k] == 0) & forks(model, k, s[k], slopes[k]))
-    for k in which:
-        if k in model.contacts:
-            continue
-        if k in model.holdable:
-            # A repulsive surface is left to the other side: beyond |λ| = 1 both fields point there.
-            forced = jnp.where(repels[k], -leaves[k], leaves[k])
-            passes = repels[k] & (came[k] != 0) & ~_grips(model, k, s[k])
-            trial[k] = jnp.where(at[k] & (forced != 0), forced, jnp.where(at[k] & passes, -came[k], trial[k]))
-        else:
-            unmoved = jnp.where(came[k] == 0, 1, came[k])
-            side = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
-            # It cannot but cross; at a double root the sign of dh/dt is rounding.
-            side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
-            trial[k] = jnp.where(at[k], side, mode[k])
-    if 1 < len(which) <= _TRIED:
-        trial, several, wrong = _best(model, t, which, at, came, leaves, trial, look, noise)
-        forked = forked | several
-    elif len(which) == 1:
-        trial, wrong = _amend(model, which, at, leaves, trial, look(trial), noise)[0], false
+    if model.pairs:
+        here = _together(here, trial)
+        for i, k in enumerate(model.holdable):
+            trial[k] = jnp.where(here.at[k] & here.dry(k), 0, trial[k])
+    every = 1 < len(which) <= _TRIED
+    seen = here.look(trial) if model.contacts or not every else None
+    noise = here.noise(seen.s if seen else {})
+    if every:
+        trial, seen, forked, wrong = _best(here, trial, noise)
     else:
-        # A bound that is reached together with that of another switch is left with it, not in a second event.
-        leaves = dict(leaves)
-        for k in which:
-            if k in model.holdable and k not in model.contacts:
-                over = s[k] * came[k].astype(t.dtype) / model.bound(k) - 1
-                tied = at[k] & (came[k] != 0) & ~repels[k] & (leaves[k] == 0) & (jnp.abs(over) <= nearly(t))
-                leaves[k] = jnp.where(tied, came[k], leaves[k])
-                trial[k] = jnp.where(tied, came[k], trial[k])
-
-        # One release or taking back a round, until nothing is violated; so many rounds do for all to change twice.
-        def amend(carry: tuple) -> tuple:
-            count, trial, _ = carry
-            return count + 1, *_amend(model, which, at, leaves, trial, look(trial), noise)
-
-        def unsettled(carry: tuple) -> Bool[Array, ""]:
-            count, _, wrong = carry
-            return wrong & (count < 2 * len(which) + 2)
-
-        trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
-        begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
-        _, trial, wrong = lax.while_loop(unsettled, amend, begin)
-
-    s, rates, slopes = look(trial)
+        assert seen is not None
+        trial, seen, forked, wrong = _search(here, trial, seen, noise)
+    at, leaves, state = here.at, here.leaves, here.state
+    s, rates, slopes, _ = seen
     if model.contacts and len(model.holdable) > 1:
-        trial = _pinned(model, t, y, state, at, leaves, trial, rates)
+        trial = _pinned(here, trial, rates)
     roots = list(state.roots)
     unsure = false
     for k in which:
@@ -135,130 +188,220 @@ def settle(
             if k in model.holdable:
                 # What begins to be held with λ at its bound need not leave: where λ goes decides.
                 edge = model.edge(k, s[k], nearly(t))
-            unsure = unsure | (at[k] & (trial[k] == 0) & (slopes[k] > 0) & (came[k] == 0))
+            if here.starts:
+                unsure = unsure | (here.open(k) & (trial[k] == 0) & (slopes[k] > 0))
         held = model.held(k, trial[k]) if k in model.holdable else False
-        roots[k] = jnp.where(at[k], jnp.where(held, edge, fresh), roots[k]).astype(jnp.int32)
+        roots[k] = jnp.where(here.open(k), jnp.where(held, edge, fresh), roots[k]).astype(jnp.int32)
+    if not (here.starts or model.steady):
+        # What is let go by a surface that has come to repel (a two-fold) might have left it before.
+        for k in which:
+            if here.dry(k):
+                forked = forked | (at[k] & (here.came[k] == 0) & (leaves[k] != 0) & (slopes[k] > 0))
     state = state._replace(mode=tuple(m.astype(jnp.int32) for m in trial.values()), roots=tuple(roots))
-    return state, unsure, forked, wrong
+    return state, unsure & forked, forked, wrong
 
 
-def forks(model: Model, k: int, multiplier: Scalar, slope: Scalar) -> Bool[Array, ""]:
-    """Whether `sgn` switch k, at its surface, can hold the solution there (|λ| <= b) and let it go as well: because the
-    surface repels, or because |λ| > 1, so that on both sides the fields point the same way.
+def _together(here: _Instant, trial: dict[int, Any]) -> _Instant:
+    """Surfaces that coincide are met at one instant, and left at one instant."""
+    model, t, y, state = here.model, here.t, here.y, here.state
+    at, leaves, parts, h = dict(here.at), dict(here.leaves), list(state.part), {}
+    for i in sorted({i for pair in model.pairs for i in pair}):
+        k = model.holdable[i]
+        values, blur = jnp.stack(model.h(k, t, y)), model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y)
+        part = 0
+        if parts[k] is not None:
+            # What is off its surface is nearest to it with the least component.
+            part = jnp.where(at[k], parts[k], jnp.argmin(values)).astype(jnp.int32)
+            parts[k] = part
+        h[i] = values[part], blur[part]
+    here = here._replace(state=state._replace(part=tuple(parts)))
+    trial, s = here.values(trial)
+    s = tuple(jnp.where(jnp.isfinite(v), v, 0) for v in s)
+    rates, matrix = model.linear(t, y, trial, s)
+    pairs, size = coinciding(model, rates, matrix), reach(model, matrix)
+    for (i, j), (same, _) in pairs.items():
+        for a, b in ((i, j), (j, i)):
+            k, other = model.holdable[a], model.holdable[b]
+            near = jnp.abs(h[b][0]) * size[a] <= h[b][1] * size[a] + 2 * jnp.abs(h[a][0]) * size[b]
+            at[other] = at[other] | (at[k] & same & near)
+        k, other = model.holdable[i], model.holdable[j]
+        both = same & at[k] & at[other]
+        pairs[i, j] = both, pairs[i, j][1]
+        # Their values reach the bounds together, each in the direction in which it resists.
+        turn = jnp.where((matrix[i, i] < 0) == (matrix[i, j] < 0), 1, -1)
+        for a, b in ((k, other), (other, k)):
+            follows = both & (leaves[b] == 0) & (here.came[b] == 0)
+            leaves[b] = jnp.where(follows, turn * leaves[a], leaves[b]).astype(jnp.int32)
+    return here._replace(at=at, leaves=leaves, pairs=pairs)
 
-    The rule is that a repulsive surface is crossed, and that static friction holds."""
-    size = jnp.abs(multiplier)
-    return (size <= model.bound(k)) & ((slope > 0) | (size > 1 + nearly(size)))
 
-
-def _grips(model: Model, k: int, multiplier: Scalar) -> Bool[Array, ""]:
-    """Whether, running backwards, static friction holds what arrives. It does not where |λ| < 1: there nothing does."""
-    if not model.static(k):
-        return jnp.zeros((), bool)
-    size = jnp.abs(multiplier)
-    return (model.direction < 0) & (size > 1 + nearly(size)) & (size <= (1 + nearly(size)) * model.bound(k))
-
-
-def _noise(model: Model, t: Scalar, y: Y, state: State, which: tuple, s: dict) -> dict:
-    """What rounding can make of d²h/dt² of the contacts: a force below it counts as none, and holds."""
-    zero = jnp.zeros((), t.dtype)
-    if not model.contacts:
-        return {k: zero for k in which}
-    values = tuple(s.get(k, v) for k, v in enumerate(model.signs(t, state)))
-    blurs = model.rounding(lambda t, y: model.rates(model.contacts, t, y, state, values), t, y)
-    return {k: zero for k in which} | dict(zip(model.contacts, blurs))
-
-
-def nearly(like: Scalar) -> float:
-    """How closely two bounds must be reached to count as reached together."""
-    return max(1e-10, 64 * float(jnp.finfo(like.dtype).eps))
-
-
-def _best(
-    model: Model, t: Scalar, which: tuple, at: dict, came: dict, leaves: dict, trial: dict, look: Any, noise: dict
-) -> tuple[dict, Bool[Array, ""], Bool[Array, ""]]:
-    """The valid assignment that holds most, of all; whether others hold as many, and whether the choice is open."""
+def _best(here: _Instant, trial: dict, noise: dict) -> tuple[dict, _Look, Bool[Array, ""], Bool[Array, ""]]:
+    """The assignment to be preferred, of all that are valid; what it leads to; whether there is another solution; and
+    whether the choice is open."""
+    model, t, which, at, came, leaves = here.model, here.t, here.which, here.at, here.came, here.leaves
     options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
     table = np.array(list(itertools.product(*options)), np.int32)
+    yes, none = jnp.ones((), bool), jnp.zeros((), jnp.int32)
 
-    def judge(row: Int[Array, " m"]) -> tuple[Bool[Array, ""], Int[Array, ""], Int[Array, ""]]:
+    def judge(row: Int[Array, " m"]) -> tuple[Any, ...]:
         mode = dict(trial)
         for i, k in enumerate(which):
             mode[k] = jnp.where(at[k], row[i], trial[k]).astype(jnp.int32)
-        s, rates, slopes = look(mode)
-        valid, held, kept = jnp.ones((), bool), jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
+        seen = here.look(mode)
+        s, rates, slopes, spans = seen
+        valid, sound, clear, repelled, rank = yes, yes, yes, ~yes, none
         for i, k in enumerate(which):
-            small = nearly(t) * jnp.abs(slopes[k])
+            held, crosses = ~yes, (row[i] == -came[k]) & (came[k] != 0)
             if k in model.contacts:
-                stays = row[i] == 1
-                law = jnp.where(
-                    stays, (s[k] * slopes[k] >= -noise[k]) & (leaves[k] == 0), (rates[k] > noise[k]) | (leaves[k] != 0)
-                )
+                held = row[i] == 1
+                stays = (s[k] * slopes[k] >= -noise[k]) & (leaves[k] == 0)
+                law = strict = jnp.where(held, stays, (rates[k] > noise[k]) | (leaves[k] != 0))
+            elif k in model.holdable:
+                held = row[i] == 0
+                small = nearly(t) * jnp.abs(slopes[k])
+                opening = rates[k] * row[i].astype(rates[k].dtype)
+                # Who has just left, at this very instant, is at the bound and may have dh/dt = 0.
+                goes = (opening > small) | ((row[i] == came[k]) & (opening >= -small))
+                forced = jnp.where(slopes[k] >= 0, -leaves[k], leaves[k])
+                # With b = 1 dh/dt is zero too where λ reaches it, as far as it does.
+                forced = (row[i] == forced) & (opening >= -1e-6 * jnp.abs(slopes[k]))
+                bound = model.bound(k)
+                left = (came[k] != 0) & (s[k] * came[k].astype(t.dtype) >= (1 - nearly(t)) * bound)
+                sticks = (jnp.abs(s[k]) <= (1 + nearly(t)) * bound) & (leaves[k] == 0) & ~left
+                law = jnp.where(held, sticks, jnp.where(leaves[k] == 0, goes, forced))
+                # Another solution is one that clearly leaves.
+                strict = law & (held | (leaves[k] != 0) | (opening > small))
+                repels = (slopes[k] >= 0) & (came[k] != 0) & ~here.grips(k, s[k])
+                repelled = repelled | (at[k] & held & repels)
             else:
-                stays = (row[i] == 0) & (k in model.holdable)
-                if k in model.holdable:
-                    # Who has just left, at this very instant, is at the bound and may have dh/dt = 0.
-                    opening = rates[k] * row[i].astype(rates[k].dtype)
-                    goes = (opening > small) | ((row[i] == came[k]) & (opening >= -small))
-                    forced = jnp.where(slopes[k] >= 0, -leaves[k], leaves[k])
-                    # With b = 1 dh/dt is zero too where λ reaches it, as far as it does.
-                    forced = (row[i] == forced) & (opening >= -1e-6 * jnp.abs(slopes[k]))
-                    goes = jnp.where(leaves[k] == 0, goes, forced)
-                    bound = model.bound(k)
-                    left = (came[k] != 0) & (s[k] * came[k].astype(t.dtype) >= (1 - nearly(t)) * bound)
-                    attracts = (slopes[k] < 0) | (came[k] == 0) | _grips(model, k, s[k])
-                    sticks = (jnp.abs(s[k]) <= (1 + nearly(t)) * bound) & (leaves[k] == 0) & attracts & ~left
-                else:
-                    crosses = (leaves[k] != 0) & (came[k] != 0)
-                    unmoved = jnp.where(came[k] == 0, 1, came[k])
-                    onward = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
-                    goes = row[i] == jnp.where(crosses, -came[k], onward)
-                    sticks = jnp.zeros((), bool)
-                law = jnp.where(stays, sticks, goes)
+                turns = (leaves[k] != 0) & (came[k] != 0)  # it cannot but cross
+                unmoved = jnp.where(came[k] == 0, 1, came[k])
+                onward = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
+                law = strict = row[i] == jnp.where(turns, -came[k], onward)
             # A switch that is not at its surface has no choice: its first option stands for what it is.
-            valid = valid & jnp.where(at[k], law, row[i] == options[i][0])
-            held = held + (at[k] & stays).astype(jnp.int32)
-            if k in model.holdable:
-                kept = kept + (at[k] & stays & model.held(k, came[k])).astype(jnp.int32)
-        return valid, held, kept
+            idle = row[i] == options[i][0]
+            valid = valid & jnp.where(at[k], row[i] == came[k] if k in (here.given or ()) else law, idle)
+            sound, clear = sound & jnp.where(at[k], law, idle), clear & jnp.where(at[k], strict, idle)
+            kept = held & (model.held(k, came[k]) if k in model.holdable else False)
+            for weight, better in ((25, held), (5, kept), (1, crosses)):
+                rank = rank + jnp.where(at[k] & better, weight, 0)
+        for (i, j), (same, ratio) in here.pairs.items():
+            k, other = model.holdable[i], model.holdable[j]
+            a, b = mode[k], mode[other]
+            one = ~same | (a.astype(t.dtype) == ratio * b.astype(t.dtype))
+            # Where only their effects are parallel, one surface that is held does not hold the other.
+            still = negligible(rates[k], spans[k]) & negligible(rates[other], spans[other])
+            one = one & (still | ~(model.held(k, a) & model.held(other, b)))
+            valid, sound, clear = valid & one, sound & one, clear & one
+        return valid, sound, clear, (rank + jnp.where(repelled, 0, 125)).astype(jnp.int32), seen
 
-    valid, held, kept = jax.vmap(judge)(jnp.asarray(table))
-    most = jnp.max(jnp.where(valid, held, -1))
-    several = jnp.sum(valid & (held == most)) > 1
-    score = jnp.where(valid & (held == most), kept, -1)
+    valid, sound, clear, rank, seen = jax.vmap(judge)(jnp.asarray(table))
+    score = jnp.where(valid, rank, -1)
     best = jnp.argmax(score)
-    out = {k: jnp.where(at[k], jnp.asarray(table)[best, i], trial[k]).astype(jnp.int32) for i, k in enumerate(which)}
-    return trial | out, several, jnp.sum(score == score[best]) != 1
+    chosen = jnp.asarray(table)[best]
+    seen = jax.tree.map(lambda x: x[best], seen)
+    # Static friction that holds goes on doing so, as its law says: that it might let go is no other solution.
+    differs = jnp.asarray(table) != chosen
+    for i, k in enumerate(which):
+        if not here.starts and here.dry(k) and model.static(k):
+            goes_on = (came[k] == 0) & (chosen[i] == 0) & (jnp.abs(seen.s[k]) > 1)
+            differs = differs & ~(goes_on & (np.arange(len(which)) == i))
+    forked = sound[best] & jnp.any(clear & jnp.any(differs, axis=1))
+    out = {k: jnp.where(at[k], chosen[i], trial[k]).astype(jnp.int32) for i, k in enumerate(which)}
+    return trial | out, seen, forked, jnp.sum(score == score[best]) != 1
 
 
-def _pinned(model: Model, t: Scalar, y: Y, state: State, at: dict, leaves: dict, trial: dict, rates: dict) -> dict:
+def _search(
+    here: _Instant, trial: dict, seen: _Look, noise: dict
+) -> tuple[dict, _Look, Bool[Array, ""], Bool[Array, ""]]:
+    """The same for one switch, which has no choice, and for so many that not every assignment can be tried."""
+    model, t, which, at, came, leaves = here.model, here.t, here.which, here.at, here.came, here.leaves
+    s, rates, slopes, _ = seen
+    mode, first = here.state.mode, seen
+    repels = {k: slopes[k] >= 0 for k in which}
+    for k in which:
+        if k in model.contacts:
+            continue
+        if k in model.holdable:
+            # A repulsive surface is left to the other side: beyond |λ| = 1 both fields point there.
+            forced = jnp.where(repels[k], -leaves[k], leaves[k])
+            passes = repels[k] & (came[k] != 0) & ~here.grips(k, s[k])
+            trial[k] = jnp.where(at[k] & (forced != 0), forced, jnp.where(at[k] & passes, -came[k], trial[k]))
+        else:
+            unmoved = jnp.where(came[k] == 0, 1, came[k])
+            side = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
+            # It cannot but cross; at a double root the sign of dh/dt is rounding.
+            side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
+            trial[k] = jnp.where(at[k], side, mode[k])
+        if k in (here.given or ()):
+            trial[k] = mode[k]
+    if len(which) == 1:
+        trial, wrong = _amend(here, trial, here.look(trial), noise)[0], jnp.zeros((), bool)
+    else:
+        # A bound that is reached together with that of another switch is left with it, not in a second event.
+        leaves = dict(leaves)
+        for k in which:
+            if here.dry(k):
+                over = s[k] * came[k].astype(t.dtype) / model.bound(k) - 1
+                tied = here.open(k) & (came[k] != 0) & ~repels[k] & (leaves[k] == 0) & (jnp.abs(over) <= nearly(t))
+                leaves[k] = jnp.where(tied, came[k], leaves[k])
+                trial[k] = jnp.where(tied, came[k], trial[k])
+        here = here._replace(leaves=leaves)
+
+        # One release or taking back a round, until nothing is violated; so many rounds do for all to change twice.
+        def amend(carry: tuple) -> tuple:
+            count, trial, _ = carry
+            return count + 1, *_amend(here, trial, here.look(trial), noise)
+
+        def unsettled(carry: tuple) -> Bool[Array, ""]:
+            count, _, wrong = carry
+            return wrong & (count < 2 * len(which) + 2)
+
+        trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
+        begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
+        _, trial, wrong = lax.while_loop(unsettled, amend, begin)
+    seen = here.look(trial)
+    forked = jnp.zeros((), bool)
+    for k in which:
+        if here.dry(k):
+            lam, slope = first.s[k], first.slopes[k]
+            fresh = here.fresh(k)
+            if len(which) > 1:
+                # The multiplier with which it would be held, too.
+                slope = seen.slopes[k]
+                lam = jnp.where(trial[k] == 0, seen.s[k], seen.s[k] - seen.rates[k] / slope)
+                fresh = fresh | (slope > 0)
+            forked = forked | (at[k] & fresh & (here.leaves[k] == 0) & here.forks(k, lam, slope))
+    return trial, seen, forked, wrong
+
+
+def _pinned(here: _Instant, trial: dict, rates: dict) -> dict:
     """A `sgn` switch at its surface that a contact keeps there, whatever its own value, is neither side's. (One that
     has just reached its bound has dh/dt = 0 too.)"""
-    held = state._replace(mode=tuple(trial.values()))
-    s = model.values(t, y, held)
-    _, matrix = model.linear(t, y, held, s)
+    model = here.model
+    held, s = here.values(trial)
+    _, matrix = model.linear(here.t, here.y, held, s)
     out = dict(trial)
     for i, k in enumerate(model.holdable):
         if k in model.contacts:
             continue
         pull = sum(
-            jnp.where(at[c] & (trial[c] == 1), jnp.abs(matrix[i, j] * s[c]), 0)
+            jnp.where(here.at[c] & (trial[c] == 1), jnp.abs(matrix[i, j] * s[c]), 0)
             for j, c in enumerate(model.holdable)
             if c in model.contacts
         )
-        pinned = at[k] & (leaves[k] == 0) & (pull > 0) & (jnp.abs(rates[k]) <= 1e-10 * pull)
+        pinned = here.open(k) & (here.leaves[k] == 0) & (pull > 0) & (jnp.abs(rates[k]) <= 1e-10 * pull)
         out[k] = jnp.where(pinned, 0, trial[k]).astype(jnp.int32)
     return out
 
 
-def _amend(
-    model: Model, which: tuple, at: dict, leaves: dict, trial: dict, seen: tuple, noise: dict
-) -> tuple[dict, Bool[Array, ""]]:
+def _amend(here: _Instant, trial: dict, seen: _Look, noise: dict) -> tuple[dict, Bool[Array, ""]]:
     """One release, or one taking back, of the switch that violates its law most."""
-    s, rates, slopes = seen
+    model, which = here.model, here.which
+    s, rates, slopes, _ = seen
     excess, opposed = [], []
     for k in which:
-        held = at[k] & model.held(k, trial[k]) if k in model.holdable else jnp.zeros((), bool)
+        held = here.open(k) & model.held(k, trial[k]) if k in model.holdable else jnp.zeros((), bool)
         if k in model.contacts:
             over, against = -s[k] * slopes[k] - noise[k], -rates[k]
         else:
@@ -266,7 +409,7 @@ def _amend(
             against = -rates[k] * trial[k].astype(rates[k].dtype)
         excess.append(jnp.where(held, over, -1))
         # What has just left has its λ at the bound (or it crosses): dh/dt may be zero but for rounding.
-        free = at[k] & ~held & (trial[k] != 0 if k not in model.contacts else True) & (leaves[k] == 0)
+        free = here.open(k) & ~held & (trial[k] != 0 if k not in model.contacts else True) & (here.leaves[k] == 0)
         opposed.append(jnp.where(free & (against > 1e-10 * jnp.abs(slopes[k])), against, 0))
     worst = jnp.stack(excess)
     back = jnp.stack(opposed)
@@ -282,4 +425,10 @@ def _amend(
             taken = jnp.where(slopes[k] < 0, 0, -trial[k])
             side = jnp.where((s[k] >= 0) == (slopes[k] < 0), 1, -1)  # where dh/dt = slope (s - λ) points
         out[k] = jnp.where(first, side, jnp.where(again, taken, trial[k])).astype(jnp.int32)
-    return out, release | retake
+    # Surfaces that coincide are left and held together.
+    moved = dict(out)
+    for (i, j), (same, ratio) in here.pairs.items():
+        for k, other in ((model.holdable[i], model.holdable[j]), (model.holdable[j], model.holdable[i])):
+            follows = same & (out[k] != trial[k]) & here.open(other)
+            moved[other] = jnp.where(follows, ratio.astype(jnp.int32) * out[k], moved[other]).astype(jnp.int32)
+    return moved, release | retake
