@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ._filippov import Model
+from ._filippov import Model, State
 from ._linear import linear_solve, parallel
-from ._types import Scalar
+from ._system import frozen
+from ._types import Scalar, Y
 
 
 Pairs = dict[tuple[int, int], tuple[Bool[Array, ""], Float[Array, ""]]]
@@ -45,19 +46,63 @@ def attraction(matrix: Float[Array, "m m"], held: Bool[Array, " m"], pairs: Pair
     m = len(held)
     if m == 1:
         return matrix[0]
-    # Surfaces that coincide are left together, each to its side, and held as one.
+    whole, first = _as_one(matrix, held, pairs)
+    inverse, inner = _inverse(whole, first)
+    free = jnp.diag(whole) - jnp.sum((whole @ inner) * whole.T, axis=1)
+    out = jnp.where(first, 1 / jnp.diag(inverse), free)
+    size = jnp.sum(jnp.abs(matrix), axis=1)
+    for (i, j), (same, _) in pairs.items():
+        out = jnp.where(same & (np.arange(m) == j), out[i] * size[j] / size[i], out)
+    return out
+
+
+def _as_one(
+    matrix: Float[Array, "m m"], held: Bool[Array, " m"], pairs: Pairs
+) -> tuple[Float[Array, "m m"], Bool[Array, " m"]]:
+    """The effects of switches that leave coinciding surfaces together, each to its side; and which are held, of those
+    that coincide the first only."""
+    m = len(held)
     whole, first = matrix, held
     for (i, j), (same, ratio) in pairs.items():
         swap = np.arange(m)
         swap[[i, j]] = j, i
         whole = whole + jnp.where(same & (swap != np.arange(m)), ratio, 0) * matrix[:, swap]
         first = first & ~(same & held[i] & (np.arange(m) == j))
-    both = first[:, None] & first[None, :]
-    eye = jnp.eye(m, dtype=matrix.dtype)
+    return whole, first
+
+
+def _inverse(whole: Float[Array, "m m"], first: Bool[Array, " m"]) -> tuple[Float[Array, "m m"], Float[Array, "m m"]]:
+    """The inverse over what is held, with the identity for the rest and with zero."""
+    eye, both = jnp.eye(len(first), dtype=whole.dtype), first[:, None] & first[None, :]
     inverse = jax.vmap(linear_solve, in_axes=(None, 0), out_axes=1)(jnp.where(both, whole, eye), eye)
-    inner = jnp.where(both, inverse, 0)
-    free = jnp.diag(whole) - jnp.sum((whole @ inner) * whole.T, axis=1)
-    out = jnp.where(first, 1 / jnp.diag(inverse), free)
-    for (i, j), (same, _) in pairs.items():
-        out = jnp.where(same & (np.arange(m) == j), out[i], out)
+    return inverse, jnp.where(both, inverse, 0)
+
+
+def escapes(model: Model, t: Scalar, y: Y, state: State) -> Bool[Array, ""]:
+    """Whether a solution that slides may leave at any time: a surface repels, and what else holds can go on doing so
+    when it is let go to one of its sides. So it is beyond a two-fold, where the fields on both sides have become
+    tangent to the surface (n · f⁺ = n · f⁻ = 0), as M_kk changes its sign there."""
+    model, t, y = frozen((model, t, y))
+    which = model.holdable
+    s = model.values(t, y, state)
+    rates, matrix = model.linear(t, y, state, s)
+    held = jnp.stack([model.held(k, state.mode[k]) for k in which])
+    pairs = coinciding(model, rates, matrix)
+    repels = held & (attraction(matrix, held, pairs) > 0)
+    repels = repels & np.array([k not in model.contacts for k in which])
+    if len(which) == 1:
+        return repels[0]
+    whole, first = _as_one(matrix, held, pairs)
+    _, inner = _inverse(whole, first)
+    values = jnp.stack([s[k] for k in which])
+    out = jnp.zeros((), bool)
+    for i in range(len(which)):
+        follow = inner[:, i] / jnp.where(first[i], inner[i, i], 1)  # dλ_l/ds_i
+        for side in (1, -1):
+            then = values + follow * (side - values[i])
+            fine = jnp.ones((), bool)
+            for n, k in enumerate(which):
+                within = then[n] >= 0 if k in model.contacts else jnp.abs(then[n]) <= model.bound(k)
+                fine = fine & (within | ~first[n])
+            out = out | (repels[i] & first[i] & (side * values[i] < 1) & fine)
     return out

@@ -38,7 +38,8 @@ class _Instant(NamedTuple):
     at: dict[int, Bool[Array, ""]]
     leaves: dict[int, Int[Array, ""]]
     given: tuple[int, ...] | None
-    pairs: Pairs
+    pairs: Pairs = {}
+    pushed: dict[int, Int[Array, ""]] = {}  # to which side those go that leave a surface with others
 
     @property
     def which(self) -> tuple[int, ...]:
@@ -59,6 +60,12 @@ class _Instant(NamedTuple):
     def open(self, k: int) -> Bool[Array, ""]:
         """Whether its mode is to be chosen."""
         return jnp.zeros((), bool) if k in (self.given or ()) else self.at[k]
+
+    def side(self, k: int, slope: Scalar) -> Int[Array, ""]:
+        """To which side one goes that leaves its surface: where both fields point beyond |λ| = 1, from a surface that
+        repels to the other side."""
+        alone = jnp.where(slope >= 0, -self.leaves[k], self.leaves[k])
+        return jnp.where(self.pushed[k] == 0, alone, self.pushed[k]) if k in self.pushed else alone
 
     def fresh(self, k: int) -> Bool[Array, ""] | bool:
         """Whether it comes to its surface only now."""
@@ -85,13 +92,29 @@ class _Instant(NamedTuple):
                 spans = spans | dict(zip(model.holdable, reach(model, matrix)))
         return _Look({k: s[k] for k in which}, rates, slopes, spans)
 
-    def forks(self, k: int, multiplier: Scalar, slope: Scalar) -> Bool[Array, ""]:
-        """Whether `sgn` switch k, at its surface, can hold the solution there (|λ| <= b) and let it go as well: because
-        the surface repels, or because |λ| > 1, so that on both sides the fields point the same way.
-
-        The rule is that a repulsive surface is crossed, and that static friction holds."""
-        size = jnp.abs(multiplier)
-        return (size <= self.model.bound(k)) & ((slope > 0) | (size > 1 + nearly(size)))
+    def loads(self, mode: dict[int, Any], seen: _Look) -> dict[int, tuple[Scalar, Any]]:
+        """The multiplier with which each `sgn` switch is held, or would be, and its bound: where surfaces coincide those
+        of one switch that does what they do together."""
+        model, dry = self.model, [k for k in self.which if self.dry(k)]
+        out = {k: (seen.s[k], model.bound(k)) for k in dry}
+        if self.pairs:
+            trial, s = self.values(mode)
+            _, matrix = model.linear(self.t, self.y, trial, s)
+            for n, k in enumerate(model.holdable):
+                if k not in dry:
+                    continue
+                effect, load, most = matrix[n, n], matrix[n, n] * s[k], jnp.abs(matrix[n, n]) * model.bound(k)
+                for (i, j), (same, ratio) in self.pairs.items():
+                    if n in (i, j):
+                        m = j if n == i else i
+                        other, acts = model.holdable[m], jnp.where(same, matrix[n, m], 0)
+                        effect, load = effect + ratio * acts, load + acts * s[other]
+                        most = most + jnp.abs(acts) * model.bound(other)
+                out[k] = load / effect, most / jnp.abs(effect)
+        return {
+            k: (jnp.where(mode[k] == 0, lam, seen.s[k] - seen.rates[k] / seen.slopes[k]), bound)
+            for k, (lam, bound) in out.items()
+        }
 
     def grips(self, k: int, multiplier: Scalar) -> Bool[Array, ""]:
         """Whether, running backwards, static friction holds what arrives. It does not where |λ| < 1: there nothing
@@ -149,7 +172,7 @@ def settle(
     false = jnp.zeros((), bool)
     if not which:
         return state, false, false, false
-    here = _Instant(model, t, y, state, at, leaves, given, {})
+    here = _Instant(model, t, y, state, at, leaves, given)
     mode = dict(enumerate(state.mode))
     trial = dict(mode)
     for k in which:
@@ -168,7 +191,7 @@ def settle(
         trial, seen, forked, wrong = _best(here, trial, noise)
     else:
         assert seen is not None
-        trial, seen, forked, wrong = _search(here, trial, seen, noise)
+        trial, seen, forked, wrong = (_alone if len(which) == 1 else _search)(here, trial, seen, noise)
     at, leaves, state = here.at, here.leaves, here.state
     s, rates, slopes, _ = seen
     if model.contacts and len(model.holdable) > 1:
@@ -211,7 +234,7 @@ def _together(here: _Instant, trial: dict[int, Any]) -> _Instant:
         part = 0
         if parts[k] is not None:
             # What is off its surface is nearest to it with the least component.
-            part = jnp.where(at[k], parts[k], jnp.argmin(values)).astype(jnp.int32)
+            part = jnp.where(at[k], parts[k], jnp.argmin(values).astype(jnp.int32))
             parts[k] = part
         h[i] = values[part], blur[part]
     here = here._replace(state=state._replace(part=tuple(parts)))
@@ -219,6 +242,7 @@ def _together(here: _Instant, trial: dict[int, Any]) -> _Instant:
     s = tuple(jnp.where(jnp.isfinite(v), v, 0) for v in s)
     rates, matrix = model.linear(t, y, trial, s)
     pairs, size = coinciding(model, rates, matrix), reach(model, matrix)
+    pushed = {model.holdable[i]: jnp.zeros((), jnp.int32) for i in h}
     for (i, j), (same, _) in pairs.items():
         for a, b in ((i, j), (j, i)):
             k, other = model.holdable[a], model.holdable[b]
@@ -232,7 +256,10 @@ def _together(here: _Instant, trial: dict[int, Any]) -> _Instant:
         for a, b in ((k, other), (other, k)):
             follows = both & (leaves[b] == 0) & (here.came[b] == 0)
             leaves[b] = jnp.where(follows, turn * leaves[a], leaves[b]).astype(jnp.int32)
-    return here._replace(at=at, leaves=leaves, pairs=pairs)
+        for n, a in ((i, k), (j, other)):
+            push = jnp.where(matrix[n, n] < 0, leaves[a], -leaves[a])
+            pushed[a] = jnp.where(both, push, pushed[a])
+    return here._replace(at=at, leaves=leaves, pairs=pairs, pushed=pushed)
 
 
 def _best(here: _Instant, trial: dict, noise: dict) -> tuple[dict, _Look, Bool[Array, ""], Bool[Array, ""]]:
@@ -262,9 +289,8 @@ def _best(here: _Instant, trial: dict, noise: dict) -> tuple[dict, _Look, Bool[A
                 opening = rates[k] * row[i].astype(rates[k].dtype)
                 # Who has just left, at this very instant, is at the bound and may have dh/dt = 0.
                 goes = (opening > small) | ((row[i] == came[k]) & (opening >= -small))
-                forced = jnp.where(slopes[k] >= 0, -leaves[k], leaves[k])
                 # With b = 1 dh/dt is zero too where λ reaches it, as far as it does.
-                forced = (row[i] == forced) & (opening >= -1e-6 * jnp.abs(slopes[k]))
+                forced = (row[i] == here.side(k, slopes[k])) & (opening >= -1e-6 * jnp.abs(slopes[k]))
                 bound = model.bound(k)
                 left = (came[k] != 0) & (s[k] * came[k].astype(t.dtype) >= (1 - nearly(t)) * bound)
                 sticks = (jnp.abs(s[k]) <= (1 + nearly(t)) * bound) & (leaves[k] == 0) & ~left
@@ -311,67 +337,81 @@ def _best(here: _Instant, trial: dict, noise: dict) -> tuple[dict, _Look, Bool[A
     return trial | out, seen, forked, jnp.sum(score == score[best]) != 1
 
 
+def _guess(here: _Instant, trial: dict, seen: _Look) -> dict:
+    """What is held as a first guess: all but what leaves, what repels, and what cannot be held."""
+    model, at, came, leaves, out = here.model, here.at, here.came, here.leaves, dict(trial)
+    for k in here.which:
+        if k in (here.given or ()):
+            out[k] = came[k]
+        elif here.dry(k):
+            side, repels = here.side(k, seen.slopes[k]), seen.slopes[k] >= 0
+            passes = repels & (came[k] != 0) & ~here.grips(k, seen.s[k])
+            out[k] = jnp.where(at[k] & (side != 0), side, jnp.where(at[k] & passes, -came[k], trial[k]))
+        elif k not in model.contacts:
+            unmoved = jnp.where(came[k] == 0, 1, came[k])
+            side = jnp.where(seen.rates[k] == 0, unmoved, jnp.sign(seen.rates[k]).astype(jnp.int32))
+            # It cannot but cross; at a double root the sign of dh/dt is rounding.
+            side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
+            out[k] = jnp.where(at[k], side, came[k])
+    return out
+
+
+def _alone(
+    here: _Instant, trial: dict, seen: _Look, noise: dict
+) -> tuple[dict, _Look, Bool[Array, ""], Bool[Array, ""]]:
+    """The same as `_best` for one switch, which has no choice."""
+    ((k, at),) = here.at.items()
+    first = _guess(here, trial, seen)
+    trial = _amend(here, first, here.look(first), noise)[0]
+    forked = jnp.zeros((), bool)
+    if here.dry(k):
+        held = _either(seen.s[k], here.model.bound(k), seen.slopes[k])
+        forked = at & here.fresh(k) & (here.leaves[k] == 0) & held
+    return trial, here.look(trial), forked, jnp.zeros((), bool)
+
+
+def _either(multiplier: Scalar, bound: Any, slope: Scalar) -> Bool[Array, ""]:
+    """Whether a surface can hold the solution (|λ| <= b) and let it go as well: because it repels, or because |λ| > 1,
+    so that on both sides the fields point the same way."""
+    size = jnp.abs(multiplier)
+    return (size <= bound) & ((slope > 0) | (size > 1 + nearly(size)))
+
+
 def _search(
     here: _Instant, trial: dict, seen: _Look, noise: dict
 ) -> tuple[dict, _Look, Bool[Array, ""], Bool[Array, ""]]:
-    """The same for one switch, which has no choice, and for so many that not every assignment can be tried."""
-    model, t, which, at, came, leaves = here.model, here.t, here.which, here.at, here.came, here.leaves
-    s, rates, slopes, _ = seen
-    mode, first = here.state.mode, seen
-    repels = {k: slopes[k] >= 0 for k in which}
-    for k in which:
-        if k in model.contacts:
-            continue
-        if k in model.holdable:
-            # A repulsive surface is left to the other side: beyond |λ| = 1 both fields point there.
-            forced = jnp.where(repels[k], -leaves[k], leaves[k])
-            passes = repels[k] & (came[k] != 0) & ~here.grips(k, s[k])
-            trial[k] = jnp.where(at[k] & (forced != 0), forced, jnp.where(at[k] & passes, -came[k], trial[k]))
-        else:
-            unmoved = jnp.where(came[k] == 0, 1, came[k])
-            side = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
-            # It cannot but cross; at a double root the sign of dh/dt is rounding.
-            side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
-            trial[k] = jnp.where(at[k], side, mode[k])
-        if k in (here.given or ()):
-            trial[k] = mode[k]
-    if len(which) == 1:
-        trial, wrong = _amend(here, trial, here.look(trial), noise)[0], jnp.zeros((), bool)
-    else:
-        # A bound that is reached together with that of another switch is left with it, not in a second event.
-        leaves = dict(leaves)
-        for k in which:
-            if here.dry(k):
-                over = s[k] * came[k].astype(t.dtype) / model.bound(k) - 1
-                tied = here.open(k) & (came[k] != 0) & ~repels[k] & (leaves[k] == 0) & (jnp.abs(over) <= nearly(t))
-                leaves[k] = jnp.where(tied, came[k], leaves[k])
-                trial[k] = jnp.where(tied, came[k], trial[k])
-        here = here._replace(leaves=leaves)
-
-        # One release or taking back a round, until nothing is violated; so many rounds do for all to change twice.
-        def amend(carry: tuple) -> tuple:
-            count, trial, _ = carry
-            return count + 1, *_amend(here, trial, here.look(trial), noise)
-
-        def unsettled(carry: tuple) -> Bool[Array, ""]:
-            count, _, wrong = carry
-            return wrong & (count < 2 * len(which) + 2)
-
-        trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
-        begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
-        _, trial, wrong = lax.while_loop(unsettled, amend, begin)
-    seen = here.look(trial)
-    forked = jnp.zeros((), bool)
+    """The same for so many that not every assignment can be tried; whether there is another solution is told by letting
+    go or holding one switch, or one group of those whose surfaces coincide."""
+    which, came = here.which, here.came
+    trial = _guess(here, trial, seen)
+    # A bound that is reached together with that of another switch is left with it, not in a second event.
+    leaves = dict(here.leaves)
     for k in which:
         if here.dry(k):
-            lam, slope = first.s[k], first.slopes[k]
-            fresh = here.fresh(k)
-            if len(which) > 1:
-                # The multiplier with which it would be held, too.
-                slope = seen.slopes[k]
-                lam = jnp.where(trial[k] == 0, seen.s[k], seen.s[k] - seen.rates[k] / slope)
-                fresh = fresh | (slope > 0)
-            forked = forked | (at[k] & fresh & (here.leaves[k] == 0) & here.forks(k, lam, slope))
+            over = seen.s[k] * came[k].astype(here.t.dtype) / here.model.bound(k) - 1
+            tied = here.open(k) & (came[k] != 0) & (seen.slopes[k] < 0) & (leaves[k] == 0)
+            tied = tied & (jnp.abs(over) <= nearly(over))
+            leaves[k] = jnp.where(tied, came[k], leaves[k])
+            trial[k] = jnp.where(tied, came[k], trial[k])
+    here = here._replace(leaves=leaves)
+
+    # One release or taking back a round, until nothing is violated; so many rounds do for all to change twice.
+    def amend(carry: tuple) -> tuple:
+        count, trial, _ = carry
+        return count + 1, *_amend(here, trial, here.look(trial), noise)
+
+    def unsettled(carry: tuple) -> Bool[Array, ""]:
+        count, _, wrong = carry
+        return wrong & (count < 2 * len(which) + 2)
+
+    trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
+    begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
+    _, trial, wrong = lax.while_loop(unsettled, amend, begin)
+    seen = here.look(trial)
+    forked = jnp.zeros((), bool)
+    for k, (lam, bound) in here.loads(trial, seen).items():
+        fresh = here.fresh(k) | (seen.slopes[k] > 0)
+        forked = forked | (here.at[k] & fresh & (leaves[k] == 0) & _either(lam, bound, seen.slopes[k]))
     return trial, seen, forked, wrong
 
 

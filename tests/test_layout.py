@@ -33,6 +33,7 @@ ORDER = (
     "_solution",
     "_sensitivity",
     "_save",
+    "_attraction",
     "_settle",
     "_event",
     "_check",
