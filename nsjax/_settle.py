@@ -215,11 +215,15 @@ def settle(
                 unsure = unsure | (here.open(k) & (trial[k] == 0) & (slopes[k] > 0))
         held = model.held(k, trial[k]) if k in model.holdable else False
         roots[k] = jnp.where(here.open(k), jnp.where(held, edge, fresh), roots[k]).astype(jnp.int32)
-    if not (here.starts or model.steady):
-        # What is let go by a surface that has come to repel (a two-fold) might have left it before.
-        for k in which:
-            if here.dry(k):
-                forked = forked | (at[k] & (here.came[k] == 0) & (leaves[k] != 0) & (slopes[k] > 0))
+    for k in which if not model.steady else ():
+        if here.dry(k):
+            if here.starts:
+                (blur,) = model.rounding(lambda t, y, k=k: model.rates((k,), t, y, state, here.values(trial)[1]), t, y)
+                several = jnp.maximum(jnp.abs(rates[k]), 2 * jnp.abs(slopes[k])) <= blur  # all fields are tangent
+            else:
+                # What is let go by a surface that has come to repel, beyond a two-fold, might have left it before.
+                several = (here.came[k] == 0) & (leaves[k] != 0) & (slopes[k] > 0)
+            forked = forked | (at[k] & several)
     state = state._replace(mode=tuple(m.astype(jnp.int32) for m in trial.values()), roots=tuple(roots))
     return state, unsure & forked, forked, wrong
 
