@@ -93,8 +93,8 @@ class _Instant(NamedTuple):
         return _Look({k: s[k] for k in which}, rates, slopes, spans)
 
     def loads(self, mode: dict[int, Any], seen: _Look) -> dict[int, tuple[Scalar, Any]]:
-        """The multiplier with which each `sgn` switch is held, or would be, and its bound: where surfaces coincide those
-        of one switch that does what they do together."""
+        """The multiplier with which each `sgn` switch is held, or would be, and its bound: where surfaces coincide
+        those of one switch that does what they do together."""
         model, dry = self.model, [k for k in self.which if self.dry(k)]
         out = {k: (seen.s[k], model.bound(k)) for k in dry}
         if self.pairs:
@@ -123,9 +123,7 @@ class _Instant(NamedTuple):
             return jnp.zeros((), bool)
         size = jnp.abs(multiplier)
         return (
-            (self.model.direction < 0)
-            & (size > 1 + nearly(size))
-            & (size <= (1 + nearly(size)) * self.model.bound(k))
+            (self.model.direction < 0) & (size > 1 + nearly(size)) & (size <= (1 + nearly(size)) * self.model.bound(k))
         )
 
     def noise(self, s: dict) -> dict[int, Scalar]:
@@ -182,8 +180,8 @@ def settle(
             trial[k] = jnp.where(at[k], 0, mode[k])
     if model.pairs:
         here = _together(here, trial)
-        for i, k in enumerate(model.holdable):
-            trial[k] = jnp.where(here.at[k] & here.dry(k), 0, trial[k])
+        for k in filter(here.dry, which):
+            trial[k] = jnp.where(here.at[k], 0, trial[k])
     every = 1 < len(which) <= _TRIED
     seen = here.look(trial) if model.contacts or not every else None
     noise = here.noise(seen.s if seen else {})
@@ -219,7 +217,7 @@ def settle(
         if here.dry(k):
             if here.starts:
                 (blur,) = model.rounding(lambda t, y, k=k: model.rates((k,), t, y, state, here.values(trial)[1]), t, y)
-                several = jnp.maximum(jnp.abs(rates[k]), 2 * jnp.abs(slopes[k])) <= blur  # all fields are tangent
+                several = ~(jnp.maximum(jnp.abs(rates[k]), 2 * jnp.abs(slopes[k])) > blur)  # all fields are tangent
             else:
                 # What is let go by a surface that has come to repel, beyond a two-fold, might have left it before.
                 several = (here.came[k] == 0) & (leaves[k] != 0) & (slopes[k] > 0)
@@ -242,9 +240,9 @@ def _together(here: _Instant, trial: dict[int, Any]) -> _Instant:
             parts[k] = part
         h[i] = values[part], blur[part]
     here = here._replace(state=state._replace(part=tuple(parts)))
-    trial, s = here.values(trial)
+    first, s = here.values(trial)
     s = tuple(jnp.where(jnp.isfinite(v), v, 0) for v in s)
-    rates, matrix = model.linear(t, y, trial, s)
+    rates, matrix = model.linear(t, y, first, s)
     pairs, size = coinciding(model, rates, matrix), reach(model, matrix)
     pushed = {model.holdable[i]: jnp.zeros((), jnp.int32) for i in h}
     for (i, j), (same, _) in pairs.items():

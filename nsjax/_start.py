@@ -107,4 +107,3 @@ def start_mode(
         settled = jnp.zeros((), bool) if k in chosen else at.get(k, jnp.zeros((), bool))
         roots[k] = jnp.where(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
     return state._replace(roots=tuple(roots)), forked, result
-

@@ -251,10 +251,10 @@ class _Exact:
         self.fields[mode] = _Field(M, L, tuple(guards), rows, h, expm(M * h), np.stack(taylor, 1))
         return self.fields[mode]
 
-    def settle(self, z: np.ndarray, mode: tuple, at: set[int], leaves: dict[int, int]) -> tuple:
+    def settle(self, z: np.ndarray, mode: tuple, here: set[int], leaves: dict[int, int]) -> tuple:
         """The assignment of stick and slip to the switches at their surfaces that satisfies all laws, by trying all."""
         valid = []
-        at = sorted(at)
+        at = sorted(here)
         options = []
         for k in at:
             if self.kinds[k] == "impact":
@@ -291,7 +291,9 @@ class _Exact:
             arrived = [k for k in at if self.kinds[k] == "sgn" and mode[k] != 0]
             stuck = [k for k in at if self.holds(k, trial)]
             repelled = any(trial[k] == 0 and self.pull(k, trial) > 0 for k in arrived)
-            kept, crossed = (sum(test) for test in ([self.holds(k, mode) for k in stuck], [trial[k] == -mode[k] for k in arrived]))
+            kept, crossed = (
+                sum(test) for test in ([self.holds(k, mode) for k in stuck], [trial[k] == -mode[k] for k in arrived])
+            )
             return not repelled, len(stuck), kept, crossed
 
         best = sorted(valid, key=rank)

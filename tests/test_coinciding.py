@@ -105,8 +105,9 @@ def start(system, x, v):
 def test_elements_that_move_as_one(name, where):
     """Same events at the same times, one of them for all elements; same motion; and as unique."""
     many, one = group(name, a=0.4)
-    sol, want = solve(many, 0.0, 40.0, start(many, *STARTS[where]), **TIGHT), solve(
-        one, 0.0, 40.0, Motion(*STARTS[where]), **TIGHT
+    sol, want = (
+        solve(many, 0.0, 40.0, start(many, *STARTS[where]), **TIGHT),
+        solve(one, 0.0, 40.0, Motion(*STARTS[where]), **TIGHT),
     )
     assert sol.result == RESULTS.successful and sol.unique == want.unique
     signs = np.sign(np.asarray(many.c))
@@ -162,7 +163,9 @@ def test_derivatives_through_sticking(where):
     got, want = jax.jacfwd(many)(p), jax.jacfwd(one)(p)
     assert np.all(np.isfinite(got)) and np.max(np.abs(want)) > 0.1
     np.testing.assert_allclose(got, want, atol=1e-6)
-    by_h = jax.jacfwd(lambda c: solve(Belt(p[2:4], p[4:6], c), 0.0, 20.0, start(Belt(p[2:4], p[4:6], c), x, v), **TIGHT).y1.v)
+    by_h = jax.jacfwd(
+        lambda c: solve(Belt(p[2:4], p[4:6], c), 0.0, 20.0, start(Belt(p[2:4], p[4:6], c), x, v), **TIGHT).y1.v
+    )
     np.testing.assert_allclose(by_h(jnp.asarray([1.0, 2.0])), 0, atol=1e-6)
 
 
@@ -210,7 +213,12 @@ def test_beside_other_surfaces():
     """Two surfaces that coincide and two that do not, all of which act on one another."""
     F = jnp.asarray([0.6, 0.4])
     met = 0
-    for x, v in (([1.0, -1.0], [0.2, 0.2]), ([2.0, 1.0], [0.0, 0.0]), ([0.2, 0.1], [0.2, -0.1]), ([-2.0, 2.0], [0.5, 1])):
+    for x, v in (
+        ([1.0, -1.0], [0.2, 0.2]),
+        ([2.0, 1.0], [0.0, 0.0]),
+        ([0.2, 0.1], [0.2, -0.1]),
+        ([-2.0, 2.0], [0.5, 1]),
+    ):
         y0 = Motion(jnp.asarray(x), jnp.asarray(v, float))
         sol, want = (solve(Blocks(F, merged=m), 0.0, 20.0, y0, **TIGHT) for m in (False, True))
         assert sol.result == RESULTS.successful and sol.unique == want.unique
