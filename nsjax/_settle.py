@@ -1,5 +1,6 @@
 """The choice of mode where switches are at their surfaces."""
 
+import functools as ft
 import itertools
 from typing import Any, NamedTuple
 
@@ -92,30 +93,6 @@ class _Instant(NamedTuple):
                 spans = spans | dict(zip(model.holdable, reach(model, matrix)))
         return _Look({k: s[k] for k in which}, rates, slopes, spans)
 
-    def loads(self, mode: dict[int, Any], seen: _Look) -> dict[int, tuple[Scalar, Any]]:
-        """The multiplier with which each `sgn` switch is held, or would be, and its bound: where surfaces coincide
-        those of one switch that does what they do together."""
-        model, dry = self.model, [k for k in self.which if self.dry(k)]
-        out = {k: (seen.s[k], model.bound(k)) for k in dry}
-        if self.pairs:
-            trial, s = self.values(mode)
-            _, matrix = model.linear(self.t, self.y, trial, s)
-            for n, k in enumerate(model.holdable):
-                if k not in dry:
-                    continue
-                effect, load, most = matrix[n, n], matrix[n, n] * s[k], jnp.abs(matrix[n, n]) * model.bound(k)
-                for (i, j), (same, ratio) in self.pairs.items():
-                    if n in (i, j):
-                        m = j if n == i else i
-                        other, acts = model.holdable[m], jnp.where(same, matrix[n, m], 0)
-                        effect, load = effect + ratio * acts, load + acts * s[other]
-                        most = most + jnp.abs(acts) * model.bound(other)
-                out[k] = load / effect, most / jnp.abs(effect)
-        return {
-            k: (jnp.where(mode[k] == 0, lam, seen.s[k] - seen.rates[k] / seen.slopes[k]), bound)
-            for k, (lam, bound) in out.items()
-        }
-
     def grips(self, k: int, multiplier: Scalar) -> Bool[Array, ""]:
         """Whether, running backwards, static friction holds what arrives. It does not where |λ| < 1: there nothing
         does."""
@@ -186,17 +163,16 @@ def settle(
     seen = here.look(trial) if model.contacts or not every else None
     noise = here.noise(seen.s if seen else {})
     if every:
-        trial, seen, forked, wrong = _best(here, trial, noise)
+        trial, seen, others, wrong = _best(here, trial, noise)
     else:
         assert seen is not None
-        trial, seen, forked, wrong = (_alone if len(which) == 1 else _search)(here, trial, seen, noise)
+        trial, seen, others, wrong = (_alone if len(which) == 1 else _search)(here, trial, seen, noise)
     at, leaves, state = here.at, here.leaves, here.state
     s, rates, slopes, _ = seen
     if model.contacts and len(model.holdable) > 1:
         trial = _pinned(here, trial, rates)
-    roots = list(state.roots)
-    unsure = false
-    for k in which:
+    roots, forked, unsure = list(state.roots), jnp.any(others), false
+    for i, k in enumerate(which):
         if k in model.contacts:
             # It lifts off with h = dh/dt = 0, and where its force has reached zero d²h/dt² = 0 too.
             fresh = jnp.where(leaves[k] != 0, 3, 2)
@@ -210,7 +186,7 @@ def settle(
                 # What begins to be held with λ at its bound need not leave: where λ goes decides.
                 edge = model.edge(k, s[k], nearly(t))
             if here.starts:
-                unsure = unsure | (here.open(k) & (trial[k] == 0) & (slopes[k] > 0))
+                unsure = unsure | (here.open(k) & (trial[k] == 0) & (slopes[k] > 0) & others[i])
         held = model.held(k, trial[k]) if k in model.holdable else False
         roots[k] = jnp.where(here.open(k), jnp.where(held, edge, fresh), roots[k]).astype(jnp.int32)
     for k in which if not model.steady else ():
@@ -223,7 +199,7 @@ def settle(
                 several = (here.came[k] == 0) & (leaves[k] != 0) & (slopes[k] > 0)
             forked = forked | (at[k] & several)
     state = state._replace(mode=tuple(m.astype(jnp.int32) for m in trial.values()), roots=tuple(roots))
-    return state, unsure & forked, forked, wrong
+    return state, unsure, forked, wrong
 
 
 def _together(here: _Instant, trial: dict[int, Any]) -> _Instant:
@@ -264,79 +240,97 @@ def _together(here: _Instant, trial: dict[int, Any]) -> _Instant:
     return here._replace(at=at, leaves=leaves, pairs=pairs, pushed=pushed)
 
 
-def _best(here: _Instant, trial: dict, noise: dict) -> tuple[dict, _Look, Bool[Array, ""], Bool[Array, ""]]:
-    """The assignment to be preferred, of all that are valid; what it leads to; whether there is another solution; and
-    whether the choice is open."""
+class _Verdict(NamedTuple):
+    """What speaks for an assignment."""
+
+    valid: Bool[Array, ""]  # whether all laws are kept of switches whose mode is to be chosen
+    sound: Bool[Array, ""]  # whether all laws are
+    clear: Bool[Array, ""]  # and not just so: what leaves its surface does so with dh/dt beyond rounding
+    rank: Int[Array, ""]
+    seen: _Look
+
+
+def _judge(here: _Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> _Verdict:
+    """An assignment, one entry of `row` for each switch that may be at its surface."""
     model, t, which, at, came, leaves = here.model, here.t, here.which, here.at, here.came, here.leaves
-    options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
-    table = np.array(list(itertools.product(*options)), np.int32)
-    yes, none = jnp.ones((), bool), jnp.zeros((), jnp.int32)
-
-    def judge(row: Int[Array, " m"]) -> tuple[Any, ...]:
-        mode = dict(trial)
-        for i, k in enumerate(which):
-            mode[k] = jnp.where(at[k], row[i], trial[k]).astype(jnp.int32)
-        seen = here.look(mode)
-        s, rates, slopes, spans = seen
-        valid, sound, clear, repelled, rank = yes, yes, yes, ~yes, none
-        for i, k in enumerate(which):
-            held, crosses = ~yes, (row[i] == -came[k]) & (came[k] != 0)
-            if k in model.contacts:
-                held = row[i] == 1
-                stays = (s[k] * slopes[k] >= -noise[k]) & (leaves[k] == 0)
-                law = strict = jnp.where(held, stays, (rates[k] > noise[k]) | (leaves[k] != 0))
-            elif k in model.holdable:
-                held = row[i] == 0
-                small = nearly(t) * jnp.abs(slopes[k])
-                opening = rates[k] * row[i].astype(rates[k].dtype)
-                # Who has just left, at this very instant, is at the bound and may have dh/dt = 0.
-                goes = (opening > small) | ((row[i] == came[k]) & (opening >= -small))
-                # With b = 1 dh/dt is zero too where λ reaches it, as far as it does.
-                forced = (row[i] == here.side(k, slopes[k])) & (opening >= -1e-6 * jnp.abs(slopes[k]))
-                bound = model.bound(k)
-                left = (came[k] != 0) & (s[k] * came[k].astype(t.dtype) >= (1 - nearly(t)) * bound)
-                sticks = (jnp.abs(s[k]) <= (1 + nearly(t)) * bound) & (leaves[k] == 0) & ~left
-                law = jnp.where(held, sticks, jnp.where(leaves[k] == 0, goes, forced))
-                # Another solution is one that clearly leaves.
-                strict = law & (held | (leaves[k] != 0) | (opening > small))
-                repels = (slopes[k] >= 0) & (came[k] != 0) & ~here.grips(k, s[k])
-                repelled = repelled | (at[k] & held & repels)
-            else:
-                turns = (leaves[k] != 0) & (came[k] != 0)  # it cannot but cross
-                unmoved = jnp.where(came[k] == 0, 1, came[k])
-                onward = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
-                law = strict = row[i] == jnp.where(turns, -came[k], onward)
-            # A switch that is not at its surface has no choice: its first option stands for what it is.
-            idle = row[i] == options[i][0]
-            valid = valid & jnp.where(at[k], row[i] == came[k] if k in (here.given or ()) else law, idle)
-            sound, clear = sound & jnp.where(at[k], law, idle), clear & jnp.where(at[k], strict, idle)
-            kept = held & (model.held(k, came[k]) if k in model.holdable else False)
-            for weight, better in ((25, held), (5, kept), (1, crosses)):
-                rank = rank + jnp.where(at[k] & better, weight, 0)
-        for (i, j), (same, ratio) in here.pairs.items():
-            k, other = model.holdable[i], model.holdable[j]
-            a, b = mode[k], mode[other]
-            one = ~same | (a.astype(t.dtype) == ratio * b.astype(t.dtype))
-            # Where only their effects are parallel, one surface that is held does not hold the other.
-            still = negligible(rates[k], spans[k]) & negligible(rates[other], spans[other])
-            one = one & (still | ~(model.held(k, a) & model.held(other, b)))
-            valid, sound, clear = valid & one, sound & one, clear & one
-        return valid, sound, clear, (rank + jnp.where(repelled, 0, 125)).astype(jnp.int32), seen
-
-    valid, sound, clear, rank, seen = jax.vmap(judge)(jnp.asarray(table))
-    score = jnp.where(valid, rank, -1)
-    best = jnp.argmax(score)
-    chosen = jnp.asarray(table)[best]
-    seen = jax.tree.map(lambda x: x[best], seen)
-    # Static friction that holds goes on doing so, as its law says: that it might let go is no other solution.
-    differs = jnp.asarray(table) != chosen
+    yes, rank = jnp.ones((), bool), jnp.zeros((), jnp.int32)
+    mode = dict(trial)
     for i, k in enumerate(which):
-        if not here.starts and here.dry(k) and model.static(k):
-            goes_on = (came[k] == 0) & (chosen[i] == 0) & (jnp.abs(seen.s[k]) > 1)
-            differs = differs & ~(goes_on & (np.arange(len(which)) == i))
-    forked = sound[best] & jnp.any(clear & jnp.any(differs, axis=1))
-    out = {k: jnp.where(at[k], chosen[i], trial[k]).astype(jnp.int32) for i, k in enumerate(which)}
-    return trial | out, seen, forked, jnp.sum(score == score[best]) != 1
+        mode[k] = jnp.where(at[k], row[i], trial[k]).astype(jnp.int32)
+    seen = here.look(mode)
+    s, rates, slopes, spans = seen
+    valid, sound, clear, repelled = yes, yes, yes, ~yes
+    for i, k in enumerate(which):
+        held, crosses = ~yes, (row[i] == -came[k]) & (came[k] != 0)
+        if k in model.contacts:
+            held = row[i] == 1
+            stays = (s[k] * slopes[k] >= -noise[k]) & (leaves[k] == 0)
+            law = strict = jnp.where(held, stays, (rates[k] > noise[k]) | (leaves[k] != 0))
+        elif k in model.holdable:
+            held = row[i] == 0
+            small = nearly(t) * jnp.abs(slopes[k])
+            opening = rates[k] * row[i].astype(rates[k].dtype)
+            # Who has just left, at this very instant, is at the bound and may have dh/dt = 0.
+            goes = (opening > small) | ((row[i] == came[k]) & (opening >= -small))
+            # With b = 1 dh/dt is zero too where λ reaches it, as far as it does.
+            forced = (row[i] == here.side(k, slopes[k])) & (opening >= -1e-6 * jnp.abs(slopes[k]))
+            bound = model.bound(k)
+            left = (came[k] != 0) & (s[k] * came[k].astype(t.dtype) >= (1 - nearly(t)) * bound)
+            sticks = (jnp.abs(s[k]) <= (1 + nearly(t)) * bound) & (leaves[k] == 0) & ~left
+            law = jnp.where(held, sticks, jnp.where(leaves[k] == 0, goes, forced))
+            strict = law & (held | (leaves[k] != 0) | (opening > small))
+            repels = (slopes[k] >= 0) & (came[k] != 0) & ~here.grips(k, s[k])
+            repelled = repelled | (at[k] & held & repels)
+        else:
+            turns = (leaves[k] != 0) & (came[k] != 0)  # it cannot but cross
+            unmoved = jnp.where(came[k] == 0, 1, came[k])
+            onward = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
+            law = strict = row[i] == jnp.where(turns, -came[k], onward)
+        valid = valid & (~at[k] | (row[i] == came[k] if k in (here.given or ()) else law))
+        sound, clear = sound & (~at[k] | law), clear & (~at[k] | strict)
+        kept = held & (model.held(k, came[k]) if k in model.holdable else False)
+        for weight, better in ((25, held), (5, kept), (1, crosses)):
+            rank = rank + jnp.where(at[k] & better, weight, 0)
+    for (i, j), (same, ratio) in here.pairs.items():
+        k, other = model.holdable[i], model.holdable[j]
+        a, b = mode[k], mode[other]
+        one = ~same | (a.astype(t.dtype) == ratio * b.astype(t.dtype))
+        # Where only their effects are parallel, one surface that is held does not hold the other.
+        still = negligible(rates[k], spans[k]) & negligible(rates[other], spans[other])
+        one = one & (still | ~(model.held(k, a) & model.held(other, b)))
+        valid, sound, clear = valid & one, sound & one, clear & one
+    return _Verdict(valid, sound, clear, (rank + jnp.where(repelled, 0, 125)).astype(jnp.int32), seen)
+
+
+def _elsewhere(
+    here: _Instant, chosen: Int[Array, " m"], seen: _Look, table: Int[Array, "rows m"], clear: Bool[Array, " rows"]
+) -> Bool[Array, " m"]:
+    """Which switches have another mode in one of the assignments of a table that are `clear`. Static friction that
+    holds goes on doing so, as its law says: that it might let go is no other solution."""
+    differs = table != chosen
+    for i, k in enumerate(here.which):
+        if not here.starts and here.dry(k) and here.model.static(k):
+            goes_on = (here.came[k] == 0) & (chosen[i] == 0) & (jnp.abs(seen.s[k]) > 1)
+            differs = differs & ~(goes_on & (np.arange(len(here.which)) == i))
+    return jnp.any(differs & clear[:, None], axis=0)
+
+
+def _best(here: _Instant, trial: dict, noise: dict) -> tuple[dict, _Look, Bool[Array, " m"], Bool[Array, ""]]:
+    """The assignment to be preferred, of all that are valid; what it leads to; of each switch whether another solution
+    gives it another mode; and whether the choice is open."""
+    model, which = here.model, here.which
+    options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
+    table = jnp.asarray(np.array(list(itertools.product(*options)), np.int32))
+    found = jax.vmap(ft.partial(_judge, here, trial, noise))(table)
+    # A switch that is not at its surface has no choice: its first option stands for what it is.
+    at = jnp.stack([here.at[k] for k in which])
+    real = jnp.all(at | (table == np.array([o[0] for o in options], np.int32)), axis=1)
+    score = jnp.where(found.valid & real, found.rank, -1)
+    best = jnp.argmax(score)
+    seen = jax.tree.map(lambda x: x[best], found.seen)
+    others = _elsewhere(here, table[best], seen, table, found.sound[best] & found.clear & real)
+    out = {k: jnp.where(here.at[k], table[best, i], trial[k]).astype(jnp.int32) for i, k in enumerate(which)}
+    return trial | out, seen, others, jnp.sum(score == score[best]) != 1
 
 
 def _guess(here: _Instant, trial: dict, seen: _Look) -> dict:
@@ -360,7 +354,7 @@ def _guess(here: _Instant, trial: dict, seen: _Look) -> dict:
 
 def _alone(
     here: _Instant, trial: dict, seen: _Look, noise: dict
-) -> tuple[dict, _Look, Bool[Array, ""], Bool[Array, ""]]:
+) -> tuple[dict, _Look, Bool[Array, " m"], Bool[Array, ""]]:
     """The same as `_best` for one switch, which has no choice."""
     ((k, at),) = here.at.items()
     first = _guess(here, trial, seen)
@@ -369,7 +363,7 @@ def _alone(
     if here.dry(k):
         held = _either(seen.s[k], here.model.bound(k), seen.slopes[k])
         forked = at & here.fresh(k) & (here.leaves[k] == 0) & held
-    return trial, here.look(trial), forked, jnp.zeros((), bool)
+    return trial, here.look(trial), forked[None], jnp.zeros((), bool)
 
 
 def _either(multiplier: Scalar, bound: Any, slope: Scalar) -> Bool[Array, ""]:
@@ -381,9 +375,8 @@ def _either(multiplier: Scalar, bound: Any, slope: Scalar) -> Bool[Array, ""]:
 
 def _search(
     here: _Instant, trial: dict, seen: _Look, noise: dict
-) -> tuple[dict, _Look, Bool[Array, ""], Bool[Array, ""]]:
-    """The same for so many that not every assignment can be tried; whether there is another solution is told by letting
-    go or holding one switch, or one group of those whose surfaces coincide."""
+) -> tuple[dict, _Look, Bool[Array, " m"], Bool[Array, ""]]:
+    """The same for so many that not every assignment can be tried."""
     which, came = here.which, here.came
     trial = _guess(here, trial, seen)
     # A bound that is reached together with that of another switch is left with it, not in a second event.
@@ -409,12 +402,23 @@ def _search(
     trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
     begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
     _, trial, wrong = lax.while_loop(unsettled, amend, begin)
-    seen = here.look(trial)
-    forked = jnp.zeros((), bool)
-    for k, (lam, bound) in here.loads(trial, seen).items():
-        fresh = here.fresh(k) | (seen.slopes[k] > 0)
-        forked = forked | (here.at[k] & fresh & (leaves[k] == 0) & _either(lam, bound, seen.slopes[k]))
-    return trial, seen, forked, wrong
+    # Of all other assignments those in which one switch, or one group on surfaces that coincide, is let go or held.
+    chosen, seen, table = jnp.stack([trial[k] for k in which]), here.look(trial), []
+    for i, k in enumerate(which):
+        for value in (0, 1, -1) if here.dry(k) else ():
+            row = list(chosen)
+            row[i] = jnp.asarray(value, jnp.int32)
+            for pair, (same, ratio) in here.pairs.items():
+                a, b = (here.model.holdable[n] for n in pair)
+                if k in (a, b):
+                    n = which.index(b if k == a else a)
+                    row[n] = jnp.where(same, ratio.astype(jnp.int32) * value, row[n])
+            table.append(jnp.stack(row))
+    table = jnp.stack(table) if table else chosen[None]
+    clear = jax.vmap(ft.partial(_judge, here, trial, noise))(table).clear
+    at = jnp.stack([here.at[k] for k in which])
+    real = jnp.all(at | (table == chosen), axis=1)
+    return trial, seen, _elsewhere(here, chosen, seen, table, clear & real), wrong
 
 
 def _pinned(here: _Instant, trial: dict, rates: dict) -> dict:

@@ -67,9 +67,9 @@ def repels(case: Linear, mode: tuple[int, ...], k: int) -> bool:
     return case.M[k, k] + case.M[k, rest] @ follow > 0
 
 
-def choose(case: Linear, came: list[int], at: list[int], fresh: list[int]) -> tuple[tuple[int, ...] | None, bool]:
-    """The assignment to take for the switches `at` their surfaces, of which `fresh` came to them only now; and whether
-    it is the only one. `came`: the modes before, 0 for a side that is unknown."""
+def choose(case: Linear, came: list[int], at: list[int], fresh: list[int]) -> tuple[tuple[int, ...] | None, set[int]]:
+    """The assignment to take for the switches `at` their surfaces, of which `fresh` came to them only now; and which of
+    them have another mode in another one. `came`: the modes before, 0 for a side that is unknown."""
     found = []
     for values in itertools.product((0, 1, -1), repeat=len(at)):
         mode = list(came)
@@ -78,7 +78,7 @@ def choose(case: Linear, came: list[int], at: list[int], fresh: list[int]) -> tu
         if valid(case, tuple(mode), at):
             found.append(tuple(mode))
     if not found:
-        return None, True
+        return None, set()
 
     def rank(mode: tuple[int, ...]) -> tuple:
         held = [k for k in at if mode[k] == 0]
@@ -88,15 +88,15 @@ def choose(case: Linear, came: list[int], at: list[int], fresh: list[int]) -> tu
 
     best = sorted(found, key=rank)[::-1]
     if len(best) > 1 and rank(best[0]) == rank(best[1]):
-        return None, False
+        return None, set(at)
     s = multipliers(case, best[0])
 
     def sticks(k: int) -> bool:
         """Static friction that held before, and holds on."""
         return k not in fresh and best[0][k] == 0 and abs(s[k]) > 1
 
-    others = [mode for mode in best[1:] if not all(sticks(k) for k in at if mode[k] != best[0][k])]
-    return best[0], not others
+    differ = [{k for k in at if mode[k] != best[0][k] and not sticks(k)} for mode in best[1:]]
+    return best[0], set().union(*differ)
 
 
 def follow(case: Linear, t1: float) -> Path:
@@ -107,10 +107,11 @@ def follow(case: Linear, t1: float) -> Path:
     modes, times, unique = [], [], True
     chosen, mode0 = tuple(mode), tuple(mode)
     if at:
-        chosen, unique = choose(case, mode, at, at)
+        chosen, others = choose(case, mode, at, at)
+        unique = not others
         if chosen is None:
             return Path(mode0, [], [], unique, "open")
-        if not unique and any(chosen[k] == 0 and repels(case, chosen, k) for k in at):
+        if any(chosen[k] == 0 and repels(case, chosen, k) for k in others):
             return Path(chosen, [], [], unique, "repulsive")
         mode0 = chosen
     while True:
@@ -126,8 +127,8 @@ def follow(case: Linear, t1: float) -> Path:
         y, t = y + left[k] * v, t + left[k]
         y[k] = 0
         at = sorted({k} | {j for j in range(len(y)) if chosen[j] == 0})
-        chosen, alone = choose(case, list(chosen), at, [k])
-        unique &= alone
+        chosen, others = choose(case, list(chosen), at, [k])
+        unique &= not others
         times.append(t)
         if chosen is None:
             return Path(mode0, modes, times, unique, "open")
