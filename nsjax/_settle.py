@@ -2,7 +2,7 @@
 
 import functools as ft
 import itertools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.lax as lax
@@ -10,108 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from ._attraction import attraction, coinciding, negligible, Pairs, reach
+from ._attraction import coinciding, reach
 from ._filippov import Model, State
+from ._laws import Instant, judge, Look
 from ._linear import nearly
 from ._system import frozen
 from ._types import Scalar, Y
 
 
 _TRIED = 4  # so many switches at their surfaces are settled by trying every assignment
-
-
-class _Look(NamedTuple):
-    """What an assignment leads to, for each switch that may be at its surface."""
-
-    s: dict[int, Scalar]  # its value: a sign, or the multiplier λ
-    rates: dict[int, Scalar]  # dh/dt, of contacts d²h/dt²
-    slopes: dict[int, Scalar]  # what its value adds to that while all others that hold do so, see `attraction`
-    spans: dict[int, Scalar]  # what all `sgn` switches together may add; only of surfaces that may coincide
-
-
-class _Instant(NamedTuple):
-    """Where switches are at their surfaces, and what is known of each of them: see `settle`."""
-
-    model: Model
-    t: Scalar
-    y: Y
-    state: State
-    at: dict[int, Bool[Array, ""]]
-    leaves: dict[int, Int[Array, ""]]
-    given: tuple[int, ...] | None
-    pairs: Pairs = {}
-    pushed: dict[int, Int[Array, ""]] = {}  # to which side those go that leave a surface with others
-
-    @property
-    def which(self) -> tuple[int, ...]:
-        return tuple(self.at)
-
-    @property
-    def came(self) -> dict[int, Int[Array, ""]]:
-        return {k: self.state.mode[k] for k in self.at}
-
-    @property
-    def starts(self) -> bool:
-        return self.given is not None
-
-    def dry(self, k: int) -> bool:
-        """Whether it is a `sgn` switch that can hold the solution."""
-        return k in self.model.holdable and k not in self.model.contacts
-
-    def open(self, k: int) -> Bool[Array, ""]:
-        """Whether its mode is to be chosen."""
-        return jnp.zeros((), bool) if k in (self.given or ()) else self.at[k]
-
-    def side(self, k: int, slope: Scalar) -> Int[Array, ""]:
-        """To which side one goes that leaves its surface: where both fields point beyond |λ| = 1, from a surface that
-        repels to the other side."""
-        alone = jnp.where(slope >= 0, -self.leaves[k], self.leaves[k])
-        return jnp.where(self.pushed[k] == 0, alone, self.pushed[k]) if k in self.pushed else alone
-
-    def fresh(self, k: int) -> Bool[Array, ""] | bool:
-        """Whether it comes to its surface only now."""
-        return True if self.starts else self.came[k] != 0
-
-    def values(self, mode: dict[int, Any]) -> tuple[State, tuple]:
-        trial = self.state._replace(mode=tuple(mode.values()))
-        return trial, self.model.values(self.t, self.y, trial)
-
-    def look(self, mode: dict[int, Any]) -> _Look:
-        model, t, y, which = self.model, self.t, self.y, self.which
-        trial, s = self.values(mode)
-        rates = dict(zip(which, model.rates(which, t, y, trial, s)))
-        slopes = {k: jnp.zeros((), t.dtype) for k in which}
-        spans = slopes
-        if model.holdable:
-            _, matrix = model.linear(t, y, trial, s)
-            held = jnp.stack([model.held(k, mode[k]) for k in model.holdable])
-            effects = attraction(matrix, held, self.pairs)
-            slopes = slopes | {
-                k: matrix[i, i] if k in model.contacts else effects[i] for i, k in enumerate(model.holdable)
-            }
-            if self.pairs:
-                spans = spans | dict(zip(model.holdable, reach(model, matrix)))
-        return _Look({k: s[k] for k in which}, rates, slopes, spans)
-
-    def grips(self, k: int, multiplier: Scalar) -> Bool[Array, ""]:
-        """Whether, running backwards, static friction holds what arrives. It does not where |λ| < 1: there nothing
-        does."""
-        if not self.model.static(k):
-            return jnp.zeros((), bool)
-        size = jnp.abs(multiplier)
-        return (
-            (self.model.direction < 0) & (size > 1 + nearly(size)) & (size <= (1 + nearly(size)) * self.model.bound(k))
-        )
-
-    def noise(self, s: dict) -> dict[int, Scalar]:
-        """What rounding can make of d²h/dt² of the contacts: a force below it counts as none, and holds."""
-        model, t, y, state = self.model, self.t, self.y, self.state
-        zero = {k: jnp.zeros((), t.dtype) for k in self.which}
-        if not model.contacts:
-            return zero
-        values = tuple(s.get(k, v) for k, v in enumerate(model.signs(t, state)))
-        blurs = model.rounding(lambda t, y: model.rates(model.contacts, t, y, state, values), t, y)
-        return zero | dict(zip(model.contacts, blurs))
 
 
 def settle(
@@ -147,7 +54,7 @@ def settle(
     false = jnp.zeros((), bool)
     if not which:
         return state, false, false, false
-    here = _Instant(model, t, y, state, at, leaves, given)
+    here = Instant(model, t, y, state, at, leaves, given)
     mode = dict(enumerate(state.mode))
     trial = dict(mode)
     for k in which:
@@ -202,7 +109,7 @@ def settle(
     return state, unsure, forked, wrong
 
 
-def _together(here: _Instant, trial: dict[int, Any]) -> _Instant:
+def _together(here: Instant, trial: dict[int, Any]) -> Instant:
     """Surfaces that coincide are met at one instant, and left at one instant."""
     model, t, y, state = here.model, here.t, here.y, here.state
     at, leaves, parts, h = dict(here.at), dict(here.leaves), list(state.part), {}
@@ -240,70 +147,8 @@ def _together(here: _Instant, trial: dict[int, Any]) -> _Instant:
     return here._replace(at=at, leaves=leaves, pairs=pairs, pushed=pushed)
 
 
-class _Verdict(NamedTuple):
-    """What speaks for an assignment."""
-
-    valid: Bool[Array, ""]  # whether all laws are kept of switches whose mode is to be chosen
-    sound: Bool[Array, ""]  # whether all laws are
-    clear: Bool[Array, ""]  # and not just so: what leaves its surface does so with dh/dt beyond rounding
-    rank: Int[Array, ""]
-    seen: _Look
-
-
-def _judge(here: _Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> _Verdict:
-    """An assignment, one entry of `row` for each switch that may be at its surface."""
-    model, t, which, at, came, leaves = here.model, here.t, here.which, here.at, here.came, here.leaves
-    yes, rank = jnp.ones((), bool), jnp.zeros((), jnp.int32)
-    mode = dict(trial)
-    for i, k in enumerate(which):
-        mode[k] = jnp.where(at[k], row[i], trial[k]).astype(jnp.int32)
-    seen = here.look(mode)
-    s, rates, slopes, spans = seen
-    valid, sound, clear, repelled = yes, yes, yes, ~yes
-    for i, k in enumerate(which):
-        held, crosses = ~yes, (row[i] == -came[k]) & (came[k] != 0)
-        if k in model.contacts:
-            held = row[i] == 1
-            stays = (s[k] * slopes[k] >= -noise[k]) & (leaves[k] == 0)
-            law = strict = jnp.where(held, stays, (rates[k] > noise[k]) | (leaves[k] != 0))
-        elif k in model.holdable:
-            held = row[i] == 0
-            small = nearly(t) * jnp.abs(slopes[k])
-            opening = rates[k] * row[i].astype(rates[k].dtype)
-            # Who has just left, at this very instant, is at the bound and may have dh/dt = 0.
-            goes = (opening > small) | ((row[i] == came[k]) & (opening >= -small))
-            # With b = 1 dh/dt is zero too where λ reaches it, as far as it does.
-            forced = (row[i] == here.side(k, slopes[k])) & (opening >= -1e-6 * jnp.abs(slopes[k]))
-            bound = model.bound(k)
-            left = (came[k] != 0) & (s[k] * came[k].astype(t.dtype) >= (1 - nearly(t)) * bound)
-            sticks = (jnp.abs(s[k]) <= (1 + nearly(t)) * bound) & (leaves[k] == 0) & ~left
-            law = jnp.where(held, sticks, jnp.where(leaves[k] == 0, goes, forced))
-            strict = law & (held | (leaves[k] != 0) | (opening > small))
-            repels = (slopes[k] >= 0) & (came[k] != 0) & ~here.grips(k, s[k])
-            repelled = repelled | (at[k] & held & repels)
-        else:
-            turns = (leaves[k] != 0) & (came[k] != 0)  # it cannot but cross
-            unmoved = jnp.where(came[k] == 0, 1, came[k])
-            onward = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
-            law = strict = row[i] == jnp.where(turns, -came[k], onward)
-        valid = valid & (~at[k] | (row[i] == came[k] if k in (here.given or ()) else law))
-        sound, clear = sound & (~at[k] | law), clear & (~at[k] | strict)
-        kept = held & (model.held(k, came[k]) if k in model.holdable else False)
-        for weight, better in ((25, held), (5, kept), (1, crosses)):
-            rank = rank + jnp.where(at[k] & better, weight, 0)
-    for (i, j), (same, ratio) in here.pairs.items():
-        k, other = model.holdable[i], model.holdable[j]
-        a, b = mode[k], mode[other]
-        one = ~same | (a.astype(t.dtype) == ratio * b.astype(t.dtype))
-        # Where only their effects are parallel, one surface that is held does not hold the other.
-        still = negligible(rates[k], spans[k]) & negligible(rates[other], spans[other])
-        one = one & (still | ~(model.held(k, a) & model.held(other, b)))
-        valid, sound, clear = valid & one, sound & one, clear & one
-    return _Verdict(valid, sound, clear, (rank + jnp.where(repelled, 0, 125)).astype(jnp.int32), seen)
-
-
 def _elsewhere(
-    here: _Instant, chosen: Int[Array, " m"], seen: _Look, table: Int[Array, "rows m"], clear: Bool[Array, " rows"]
+    here: Instant, chosen: Int[Array, " m"], seen: Look, table: Int[Array, "rows m"], clear: Bool[Array, " rows"]
 ) -> Bool[Array, " m"]:
     """Which switches have another mode in one of the assignments of a table that are `clear`. Static friction that
     holds goes on doing so, as its law says: that it might let go is no other solution."""
@@ -315,13 +160,13 @@ def _elsewhere(
     return jnp.any(differs & clear[:, None], axis=0)
 
 
-def _best(here: _Instant, trial: dict, noise: dict) -> tuple[dict, _Look, Bool[Array, " m"], Bool[Array, ""]]:
+def _best(here: Instant, trial: dict, noise: dict) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
     """The assignment to be preferred, of all that are valid; what it leads to; of each switch whether another solution
     gives it another mode; and whether the choice is open."""
     model, which = here.model, here.which
     options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
     table = jnp.asarray(np.array(list(itertools.product(*options)), np.int32))
-    found = jax.vmap(ft.partial(_judge, here, trial, noise))(table)
+    found = jax.vmap(ft.partial(judge, here, trial, noise))(table)
     # A switch that is not at its surface has no choice: its first option stands for what it is.
     at = jnp.stack([here.at[k] for k in which])
     real = jnp.all(at | (table == np.array([o[0] for o in options], np.int32)), axis=1)
@@ -333,7 +178,7 @@ def _best(here: _Instant, trial: dict, noise: dict) -> tuple[dict, _Look, Bool[A
     return trial | out, seen, others, jnp.sum(score == score[best]) != 1
 
 
-def _guess(here: _Instant, trial: dict, seen: _Look) -> dict:
+def _guess(here: Instant, trial: dict, seen: Look) -> dict:
     """What is held as a first guess: all but what leaves, what repels, and what cannot be held."""
     model, at, came, leaves, out = here.model, here.at, here.came, here.leaves, dict(trial)
     for k in here.which:
@@ -353,8 +198,8 @@ def _guess(here: _Instant, trial: dict, seen: _Look) -> dict:
 
 
 def _alone(
-    here: _Instant, trial: dict, seen: _Look, noise: dict
-) -> tuple[dict, _Look, Bool[Array, " m"], Bool[Array, ""]]:
+    here: Instant, trial: dict, seen: Look, noise: dict
+) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
     """The same as `_best` for one switch, which has no choice."""
     ((k, at),) = here.at.items()
     first = _guess(here, trial, seen)
@@ -374,8 +219,8 @@ def _either(multiplier: Scalar, bound: Any, slope: Scalar) -> Bool[Array, ""]:
 
 
 def _search(
-    here: _Instant, trial: dict, seen: _Look, noise: dict
-) -> tuple[dict, _Look, Bool[Array, " m"], Bool[Array, ""]]:
+    here: Instant, trial: dict, seen: Look, noise: dict
+) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
     """The same for so many that not every assignment can be tried."""
     which, came = here.which, here.came
     trial = _guess(here, trial, seen)
@@ -415,13 +260,13 @@ def _search(
                     row[n] = jnp.where(same, ratio.astype(jnp.int32) * value, row[n])
             table.append(jnp.stack(row))
     table = jnp.stack(table) if table else chosen[None]
-    clear = jax.vmap(ft.partial(_judge, here, trial, noise))(table).clear
+    clear = jax.vmap(ft.partial(judge, here, trial, noise))(table).clear
     at = jnp.stack([here.at[k] for k in which])
     real = jnp.all(at | (table == chosen), axis=1)
     return trial, seen, _elsewhere(here, chosen, seen, table, clear & real), wrong
 
 
-def _pinned(here: _Instant, trial: dict, rates: dict) -> dict:
+def _pinned(here: Instant, trial: dict, rates: dict) -> dict:
     """A `sgn` switch at its surface that a contact keeps there, whatever its own value, is neither side's. (One that
     has just reached its bound has dh/dt = 0 too.)"""
     model = here.model
@@ -441,7 +286,7 @@ def _pinned(here: _Instant, trial: dict, rates: dict) -> dict:
     return out
 
 
-def _amend(here: _Instant, trial: dict, seen: _Look, noise: dict) -> tuple[dict, Bool[Array, ""]]:
+def _amend(here: Instant, trial: dict, seen: Look, noise: dict) -> tuple[dict, Bool[Array, ""]]:
     """One release, or one taking back, of the switch that violates its law most."""
     model, which = here.model, here.which
     s, rates, slopes, _ = seen

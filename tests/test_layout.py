@@ -34,6 +34,7 @@ ORDER = (
     "_sensitivity",
     "_save",
     "_attraction",
+    "_laws",
     "_settle",
     "_event",
     "_check",
