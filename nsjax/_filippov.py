@@ -14,10 +14,11 @@ import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ._linear import linear_solve
-from ._structure import is_affine, is_constant
+from ._linear import linear_solve, parallel
+from ._structure import dependence, is_affine, is_constant
 from ._system import AbstractSwitch, clock, frozen, impact, relay, sgn, System
 from ._types import Mode, Scalar, Y
 
@@ -61,6 +62,8 @@ class Model(eqx.Module):
     contacts: tuple[int, ...] = eqx.field(static=True)  # the impacts among them
     clocks: tuple[int, ...] = eqx.field(static=True)  # switches that tick
     jointly_affine: bool = eqx.field(static=True)
+    steady: bool = eqx.field(static=True)  # whether what acts on a surface that can be slid on is constant
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # of `holdable`: whose surfaces may coincide
     slots: tuple[Slot, ...] = eqx.field(static=True)
     window: tuple[Scalar, Scalar] | None  # the ticks between which time is kept
 
@@ -93,6 +96,29 @@ class Model(eqx.Module):
         self.holdable = tuple(k for k in range(len(self.switches)) if holds(k))
         self.contacts = tuple(k for k in self.holdable if isinstance(self.switches[k], impact))
         self.jointly_affine = is_affine(lambda s: self.field(t, y, s), zeros)
+        dry = [k for k in self.holdable if k not in self.contacts]
+
+        def effects(args: tuple[Scalar, Y, tuple]) -> list[Any]:
+            t, y, s = args
+
+            def of(j: int) -> Any:
+                return jax.jvp(
+                    lambda sj: [rate(k, t, y, s[:j] + (sj,) + s[j + 1 :]) for k in dry], (s[j],), (jnp.ones_like(s[j]),)
+                )[1]
+
+            return [of(j) for j in self.holdable]
+
+        self.steady = not dry or is_constant(effects, (t, y, zeros))
+        self.pairs = ()
+        if len(dry) > 1:
+            # Normals of surfaces that coincide are parallel, so that both depend on the same states.
+            seen = [dependence(lambda y, k=k: self.h(k, t, y), y).any(0) for k in dry]
+            self.pairs = tuple(
+                (self.holdable.index(dry[i]), self.holdable.index(dry[j]))
+                for j in range(len(dry))
+                for i in range(j)
+                if (seen[i] & seen[j]).any()
+            )
         slots = []
         for k, switch in enumerate(self.switches):
             number = 1 if isinstance(switch, relay) else self.parts[k]
@@ -236,21 +262,45 @@ class Model(eqx.Module):
         self = self._in(state)
         which = self.holdable
 
-        def rates(sigma: Float[Array, " m"]) -> Float[Array, " m"]:
+        def rates(sigma: Float[Array, " m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
             full = list(s)
             for i, k in enumerate(which):
                 full[k] = sigma[i]
-            return jnp.stack(self.rates(which, t, y, state, tuple(full)))
+            out = jnp.stack(self.rates(which, t, y, state, tuple(full)))
+            return out, out
 
-        sigma = jnp.stack([s[k] for k in which])
-        slope = jax.jacfwd(rates)(sigma)
+        slope, now = jax.jacfwd(rates, has_aux=True)(jnp.stack([s[k] for k in which]))
         if self.contacts and len(which) > 1:
             # Friction along a contact that holds already is free, and so is that of a contact without force: a trace of
             # compliance gives it the value 0.
             dry = jnp.asarray([k not in self.contacts for k in which])
             total, least = jnp.sum(jnp.abs(slope), axis=1), jnp.sqrt(jnp.finfo(t.dtype).tiny)
             slope -= jnp.diag(jnp.where(dry, jnp.where(total == 0, least, 4 * jnp.finfo(t.dtype).eps * total), 0))
-        return rates(sigma), slope
+        return now, slope
+
+    def multipliers(
+        self, slope: Float[Array, "m m"], right: Float[Array, " m"], held: Bool[Array, " m"]
+    ) -> Float[Array, " m"]:
+        """σ with slope σ = right over the holdable switches that are `held`, and 0 for the others.
+
+        Where surfaces coincide (friction elements on one velocity) slope is singular: it determines only the sum of
+        what they do. They share it in proportion to their bounds, |λ_i| / b_i = |λ_j| / b_j, as elastic elements do
+        that yield at the same deflection. No other split holds for longer: all of them reach their bounds together,
+        each in the direction in which it resists, and so when the sum of their strengths is spent.
+        """
+        m, dtype = len(held), slope.dtype
+        matrix = jnp.where(held[:, None] & held[None, :], slope, jnp.eye(m, dtype=dtype))
+        right = jnp.where(held, right, 0)
+        rows = matrix
+        for i, j in self.pairs:
+            same = held[i] & held[j] & parallel(rows[i], rows[j])
+            # In which direction each of them pushes the surface is told by the row, and each of the two rows will do.
+            weights: list[Any] = [0.0] * m
+            weights[i], weights[j] = self.bound(self.holdable[j]), -self.bound(self.holdable[i])
+            share = jnp.where(rows[i] < 0, -1.0, 1.0) * jnp.stack([jnp.asarray(w, dtype) for w in weights])
+            instead = same & (np.arange(m) == j)
+            matrix, right = jnp.where(instead[:, None], share, matrix), jnp.where(instead, 0, right)
+        return linear_solve(matrix, right)
 
     def values(self, t: Scalar, y: Y, state: State) -> tuple[Any, ...]:
         """The value of every switch in a mode: signs, and the multipliers λ of those that are held, (2.20)."""
@@ -272,7 +322,6 @@ class Model(eqx.Module):
             lam = -r / jnp.where(held, slope, 1)
             return s[:k] + (jnp.where(held, lam, s[k]),) + s[k + 1 :]
         held = jnp.stack([self.held(k, state.mode[k]) for k in which])
-        eye = jnp.eye(len(which), dtype=t.dtype)
 
         def put(sigma: Float[Array, " m"]) -> tuple[Any, ...]:
             full = list(s)
@@ -282,7 +331,7 @@ class Model(eqx.Module):
 
         def newton(_: Any, sigma: Float[Array, " m"]) -> Float[Array, " m"]:
             r, slope = self.linear(t, y, state, put(sigma))
-            return sigma + linear_solve(jnp.where(held[:, None], slope, eye), jnp.where(held, -r, 0))
+            return sigma + self.multipliers(slope, -r, held)
 
         sigma = jnp.stack([s[k] for k in which])
         if self.jointly_affine:
@@ -323,12 +372,10 @@ class Model(eqx.Module):
         s = self.values(t, y, state)
         held = jnp.stack([self.held(k, state.mode[k]) for k in which])
         _, slope = self.linear(t, y, state, s)
-        slope = jnp.where(held[:, None] & held[None, :], slope, jnp.eye(len(which), dtype=t.dtype))
 
         def push(y: Y, gaps: list[Scalar]) -> Y:
             """∂f/∂s times the values which close the gaps."""
-            gap = jnp.where(held, jnp.stack(gaps), 0)
-            move = -gap / slope[0] if len(which) == 1 else linear_solve(slope, -gap)
+            move = self.multipliers(slope, -jnp.stack(gaps), held)
             ds = [jnp.zeros_like(v) for v in s]
             for i, k in enumerate(which):
                 ds[k] = jnp.where(held[i], move[i], 0)

@@ -14,6 +14,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
+from ._attraction import escapes
 from ._compact import compact_cond
 from ._event import land, Landing
 from ._filippov import BEYOND, Model, State
@@ -222,7 +223,8 @@ class Flow(eqx.Module):
             points=points,
             transversality=jnp.ones_like(t),
             grazes=no,
-            forked=no,
+            # Beyond a two-fold, which is no event: its multiplier is 0/0.
+            forked=no if model.steady else escapes(model, t, y_end, c.state),
             result=RESULTS.successful,
             margin=jnp.full_like(t, jnp.inf),
         )
@@ -254,7 +256,7 @@ class Flow(eqx.Module):
             at, news = there.t_after * model.direction, event & there.news
             row = (at, there.y_before, there.y_after, there.slot, there.state.mode, there.transversality)
             log = log.write(events, news, *row)
-            grazed, forked = grazed | (event & there.grazes), forked | (event & there.forked)
+            grazed, forked = grazed | (event & there.grazes), forked | (moved & there.forked)
             events = events + news.astype(jnp.int32)
             halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(step.keep, 0, halted))
             result = RESULTS.where(event, there.result, result)

@@ -1,7 +1,8 @@
 """Small matrices: their products, and systems of linear equations."""
 
+import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ._types import Scalar
 
@@ -28,6 +29,20 @@ def linear_solve(a: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, 
     right = [b[i] for i in range(m)]
     whole = _determinant(columns)
     return jnp.stack([_determinant([*columns[:j], right, *columns[j + 1 :]]) / whole for j in range(m)])
+
+
+def parallel(a: Float[Array, " m"], b: Float[Array, " m"]) -> Bool[Array, ""]:
+    """Whether two rows are multiples of one another but for rounding, whatever the units of rows and columns: all
+    minors a_i b_j - a_j b_i vanish beside their two terms."""
+    a, b = lax.stop_gradient((a, b))
+    outer = a[:, None] * b[None, :]
+    size = jnp.abs(outer)
+    return jnp.all(jnp.abs(outer - outer.T) <= nearly(a) * (size + size.T))
+
+
+def nearly(like: Array) -> float:
+    """How closely two numbers must agree to count as equal, of those that are computed from several others."""
+    return max(1e-10, 64 * float(jnp.finfo(like.dtype).eps))
 
 
 def _determinant(columns: list[list[Array]]) -> Scalar:

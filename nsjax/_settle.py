@@ -1,5 +1,6 @@
 """The choice of mode where switches are at their surfaces."""
 
+import functools as ft
 import itertools
 from typing import Any
 
@@ -9,7 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+from ._attraction import coinciding, reach
 from ._filippov import Model, State
+from ._laws import Instant, judge, Look
+from ._linear import nearly
 from ._system import frozen
 from ._types import Scalar, Y
 
@@ -24,14 +28,15 @@ def settle(
     state: State,
     at: dict[int, Bool[Array, ""]],
     leaves: dict[int, Int[Array, ""]],
+    given: tuple[int, ...] | None = None,
 ) -> tuple[State, Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
     """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}, every contact one from {1, 0}.
 
-    All of them hold if that is valid (|λ| <= b, a contact force λ >= 0), else as many as can be. Of up to four
-    switches every assignment is tried; of those that hold as many the one that keeps what held before is taken, and if
-    that is not one alone either, the solution is not unique. Of more, the one that
-    violates its law most is released, to the sign of its λ, and a released switch whose motion then opposes this is
-    taken back, until nothing is violated.
+    An assignment is valid if each that holds has |λ| <= b (a contact a force λ >= 0) and each other one moves to its
+    side. Of up to four switches every assignment is tried; of the valid ones those are preferred in which no surface
+    that repels holds what arrives at it, of these the ones that hold most, that keep what held before, and that
+    cross what is met. Of more, all are held that attract, the one that violates its law most is released, to the sign
+    of its λ, and a released switch whose motion then opposes this is taken back, until nothing is violated.
 
     **Arguments:**
 
@@ -39,90 +44,42 @@ def settle(
         and one whose side is unknown has 0.
     - `at`: for each `sgn` switch whether it is at its surface, for each contact whether it rests there (dh/dt = 0).
     - `leaves`: for each switch the sign with which its λ just reached its bound, else 0.
+    - `given`: at the start of a solution the switches that keep the mode they have.
 
-    **Returns:** the new state; whether a side must be chosen (a repulsive surface (2.25) met without one); whether one
-    was chosen by rule, see `forks`; and whether not exactly one assignment was found.
+    **Returns:** the new state; whether a side must be chosen (a start on a repulsive surface (2.25)); whether there is
+    another valid assignment, see `Solution.unique`; and whether not exactly one assignment was found.
     """
     model, t, y = frozen((model, t, y))  # modes have no derivative
     which = tuple(at)
     false = jnp.zeros((), bool)
     if not which:
         return state, false, false, false
+    here = Instant(model, t, y, state, at, leaves, given)
     mode = dict(enumerate(state.mode))
-    came = {k: mode[k] for k in which}
-
-    def look(mode: dict[int, Any]) -> tuple[dict, dict, dict]:
-        trial = state._replace(mode=tuple(mode.values()))
-        s = model.values(t, y, trial)
-        rates = dict(zip(which, model.rates(which, t, y, trial, s)))
-        slopes = {k: jnp.zeros((), t.dtype) for k in which}
-        if model.holdable:
-            _, matrix = model.linear(t, y, trial, s)
-            slopes |= {k: matrix[i, i] for i, k in enumerate(model.holdable)}
-        return {k: s[k] for k in which}, rates, slopes
-
-    # First guess: everything at its surface is held, unless its surface repels or its value does not act on it.
     trial = dict(mode)
     for k in which:
         if k in model.contacts:
             trial[k] = jnp.where(at[k], jnp.where(leaves[k] != 0, 0, 1), mode[k])
         elif k in model.holdable:
             trial[k] = jnp.where(at[k], 0, mode[k])
-    s, rates, slopes = look(trial)
-    noise = _noise(model, t, y, state, which, s)
-    repels = {k: slopes[k] >= 0 for k in which}
-    forked = false
-    for k in which:
-        if k in model.holdable and k not in model.contacts:
-            forked = forked | (at[k] & (came[k] != 0) & (leaves[k] == 0) & forks(model, k, s[k], slopes[k]))
-    for k in which:
-        if k in model.contacts:
-            continue
-        if k in model.holdable:
-            # A repulsive surface is left to the other side: beyond |λ| = 1 both fields point there.
-            forced = jnp.where(repels[k], -leaves[k], leaves[k])
-            passes = repels[k] & (came[k] != 0) & ~_grips(model, k, s[k])
-            trial[k] = jnp.where(at[k] & (forced != 0), forced, jnp.where(at[k] & passes, -came[k], trial[k]))
-        else:
-            unmoved = jnp.where(came[k] == 0, 1, came[k])
-            side = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
-            # It cannot but cross; at a double root the sign of dh/dt is rounding.
-            side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
-            trial[k] = jnp.where(at[k], side, mode[k])
-    if 1 < len(which) <= _TRIED:
-        trial, several, wrong = _best(model, t, which, at, came, leaves, trial, look, noise)
-        forked = forked | several
-    elif len(which) == 1:
-        trial, wrong = _amend(model, which, at, leaves, trial, look(trial), noise)[0], false
+    if model.pairs:
+        here = _together(here, trial)
+        for k in filter(here.dry, which):
+            trial[k] = jnp.where(here.at[k], 0, trial[k])
+    every = 1 < len(which) <= _TRIED
+    seen = here.look(trial) if model.contacts or not every else None
+    noise = here.noise(seen.s if seen else {})
+    if every:
+        trial, seen, others, wrong = _best(here, trial, noise)
     else:
-        # A bound that is reached together with that of another switch is left with it, not in a second event.
-        leaves = dict(leaves)
-        for k in which:
-            if k in model.holdable and k not in model.contacts:
-                over = s[k] * came[k].astype(t.dtype) / model.bound(k) - 1
-                tied = at[k] & (came[k] != 0) & ~repels[k] & (leaves[k] == 0) & (jnp.abs(over) <= nearly(t))
-                leaves[k] = jnp.where(tied, came[k], leaves[k])
-                trial[k] = jnp.where(tied, came[k], trial[k])
-
-        # One release or taking back a round, until nothing is violated; so many rounds do for all to change twice.
-        def amend(carry: tuple) -> tuple:
-            count, trial, _ = carry
-            return count + 1, *_amend(model, which, at, leaves, trial, look(trial), noise)
-
-        def unsettled(carry: tuple) -> Bool[Array, ""]:
-            count, _, wrong = carry
-            return wrong & (count < 2 * len(which) + 2)
-
-        trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
-        begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
-        _, trial, wrong = lax.while_loop(unsettled, amend, begin)
-
-    s, rates, slopes = look(trial)
+        assert seen is not None
+        trial, seen, others, wrong = (_alone if len(which) == 1 else _search)(here, trial, seen, noise)
+    at, leaves, state = here.at, here.leaves, here.state
+    s, rates, slopes, _ = seen
     if model.contacts and len(model.holdable) > 1:
-        trial = _pinned(model, t, y, state, at, leaves, trial, rates)
-    roots = list(state.roots)
-    unsure = false
-    for k in which:
+        trial = _pinned(here, trial, rates)
+    roots, forked, unsure = list(state.roots), jnp.any(others), false
+    for i, k in enumerate(which):
         if k in model.contacts:
             # It lifts off with h = dh/dt = 0, and where its force has reached zero d²h/dt² = 0 too.
             fresh = jnp.where(leaves[k] != 0, 3, 2)
@@ -135,130 +92,207 @@ def settle(
             if k in model.holdable:
                 # What begins to be held with λ at its bound need not leave: where λ goes decides.
                 edge = model.edge(k, s[k], nearly(t))
-            unsure = unsure | (at[k] & (trial[k] == 0) & (slopes[k] > 0) & (came[k] == 0))
+            if here.starts:
+                unsure = unsure | (here.open(k) & (trial[k] == 0) & (slopes[k] > 0) & others[i])
         held = model.held(k, trial[k]) if k in model.holdable else False
-        roots[k] = jnp.where(at[k], jnp.where(held, edge, fresh), roots[k]).astype(jnp.int32)
+        roots[k] = jnp.where(here.open(k), jnp.where(held, edge, fresh), roots[k]).astype(jnp.int32)
+    for k in which if not model.steady else ():
+        if here.dry(k):
+            if here.starts:
+                (blur,) = model.rounding(lambda t, y, k=k: model.rates((k,), t, y, state, here.values(trial)[1]), t, y)
+                several = ~(jnp.maximum(jnp.abs(rates[k]), 2 * jnp.abs(slopes[k])) > blur)  # all fields are tangent
+            else:
+                # What is let go by a surface that has come to repel, beyond a two-fold, might have left it before.
+                several = (here.came[k] == 0) & (leaves[k] != 0) & (slopes[k] > 0)
+            forked = forked | (at[k] & several)
     state = state._replace(mode=tuple(m.astype(jnp.int32) for m in trial.values()), roots=tuple(roots))
     return state, unsure, forked, wrong
 
 
-def forks(model: Model, k: int, multiplier: Scalar, slope: Scalar) -> Bool[Array, ""]:
-    """Whether `sgn` switch k, at its surface, can hold the solution there (|λ| <= b) and let it go as well: because the
-    surface repels, or because |λ| > 1, so that on both sides the fields point the same way.
+def _together(here: Instant, trial: dict[int, Any]) -> Instant:
+    """Surfaces that coincide are met at one instant, and left at one instant."""
+    model, t, y, state = here.model, here.t, here.y, here.state
+    at, leaves, parts, h = dict(here.at), dict(here.leaves), list(state.part), {}
+    for i in sorted({i for pair in model.pairs for i in pair}):
+        k = model.holdable[i]
+        values, blur = jnp.stack(model.h(k, t, y)), model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y)
+        part = 0
+        if parts[k] is not None:
+            # What is off its surface is nearest to it with the least component.
+            part = jnp.where(at[k], parts[k], jnp.argmin(values).astype(jnp.int32))
+            parts[k] = part
+        h[i] = values[part], blur[part]
+    here = here._replace(state=state._replace(part=tuple(parts)))
+    first, s = here.values(trial)
+    s = tuple(jnp.where(jnp.isfinite(v), v, 0) for v in s)
+    rates, matrix = model.linear(t, y, first, s)
+    pairs, size = coinciding(model, rates, matrix), reach(model, matrix)
+    pushed = {model.holdable[i]: jnp.zeros((), jnp.int32) for i in h}
+    for (i, j), (same, _) in pairs.items():
+        for a, b in ((i, j), (j, i)):
+            k, other = model.holdable[a], model.holdable[b]
+            near = jnp.abs(h[b][0]) * size[a] <= h[b][1] * size[a] + 2 * jnp.abs(h[a][0]) * size[b]
+            at[other] = at[other] | (at[k] & same & near)
+        k, other = model.holdable[i], model.holdable[j]
+        both = same & at[k] & at[other]
+        pairs[i, j] = both, pairs[i, j][1]
+        # Their values reach the bounds together, each in the direction in which it resists.
+        turn = jnp.where((matrix[i, i] < 0) == (matrix[i, j] < 0), 1, -1)
+        for a, b in ((k, other), (other, k)):
+            follows = both & (leaves[b] == 0) & (here.came[b] == 0)
+            leaves[b] = jnp.where(follows, turn * leaves[a], leaves[b]).astype(jnp.int32)
+        for n, a in ((i, k), (j, other)):
+            push = jnp.where(matrix[n, n] < 0, leaves[a], -leaves[a])
+            pushed[a] = jnp.where(both, push, pushed[a])
+    return here._replace(at=at, leaves=leaves, pairs=pairs, pushed=pushed)
 
-    The rule is that a repulsive surface is crossed, and that static friction holds."""
-    size = jnp.abs(multiplier)
-    return (size <= model.bound(k)) & ((slope > 0) | (size > 1 + nearly(size)))
+
+def _elsewhere(
+    here: Instant, chosen: Int[Array, " m"], seen: Look, table: Int[Array, "rows m"], clear: Bool[Array, " rows"]
+) -> Bool[Array, " m"]:
+    """Which switches have another mode in one of the assignments of a table that are `clear`. Static friction that
+    holds goes on doing so, as its law says: that it might let go is no other solution."""
+    differs = table != chosen
+    for i, k in enumerate(here.which):
+        if not here.starts and here.dry(k) and here.model.static(k):
+            goes_on = (here.came[k] == 0) & (chosen[i] == 0) & (jnp.abs(seen.s[k]) > 1)
+            differs = differs & ~(goes_on & (np.arange(len(here.which)) == i))
+    return jnp.any(differs & clear[:, None], axis=0)
 
 
-def _grips(model: Model, k: int, multiplier: Scalar) -> Bool[Array, ""]:
-    """Whether, running backwards, static friction holds what arrives. It does not where |λ| < 1: there nothing does."""
-    if not model.static(k):
-        return jnp.zeros((), bool)
-    size = jnp.abs(multiplier)
-    return (model.direction < 0) & (size > 1 + nearly(size)) & (size <= (1 + nearly(size)) * model.bound(k))
-
-
-def _noise(model: Model, t: Scalar, y: Y, state: State, which: tuple, s: dict) -> dict:
-    """What rounding can make of d²h/dt² of the contacts: a force below it counts as none, and holds."""
-    zero = jnp.zeros((), t.dtype)
-    if not model.contacts:
-        return {k: zero for k in which}
-    values = tuple(s.get(k, v) for k, v in enumerate(model.signs(t, state)))
-    blurs = model.rounding(lambda t, y: model.rates(model.contacts, t, y, state, values), t, y)
-    return {k: zero for k in which} | dict(zip(model.contacts, blurs))
-
-
-def nearly(like: Scalar) -> float:
-    """How closely two bounds must be reached to count as reached together."""
-    return max(1e-10, 64 * float(jnp.finfo(like.dtype).eps))
-
-
-def _best(
-    model: Model, t: Scalar, which: tuple, at: dict, came: dict, leaves: dict, trial: dict, look: Any, noise: dict
-) -> tuple[dict, Bool[Array, ""], Bool[Array, ""]]:
-    """The valid assignment that holds most, of all; whether others hold as many, and whether the choice is open."""
+def _best(here: Instant, trial: dict, noise: dict) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
+    """The assignment to be preferred, of all that are valid; what it leads to; of each switch whether another solution
+    gives it another mode; and whether the choice is open."""
+    model, which = here.model, here.which
     options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
-    table = np.array(list(itertools.product(*options)), np.int32)
-
-    def judge(row: Int[Array, " m"]) -> tuple[Bool[Array, ""], Int[Array, ""], Int[Array, ""]]:
-        mode = dict(trial)
-        for i, k in enumerate(which):
-            mode[k] = jnp.where(at[k], row[i], trial[k]).astype(jnp.int32)
-        s, rates, slopes = look(mode)
-        valid, held, kept = jnp.ones((), bool), jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
-        for i, k in enumerate(which):
-            small = nearly(t) * jnp.abs(slopes[k])
-            if k in model.contacts:
-                stays = row[i] == 1
-                law = jnp.where(
-                    stays, (s[k] * slopes[k] >= -noise[k]) & (leaves[k] == 0), (rates[k] > noise[k]) | (leaves[k] != 0)
-                )
-            else:
-                stays = (row[i] == 0) & (k in model.holdable)
-                if k in model.holdable:
-                    # Who has just left, at this very instant, is at the bound and may have dh/dt = 0.
-                    opening = rates[k] * row[i].astype(rates[k].dtype)
-                    goes = (opening > small) | ((row[i] == came[k]) & (opening >= -small))
-                    forced = jnp.where(slopes[k] >= 0, -leaves[k], leaves[k])
-                    # With b = 1 dh/dt is zero too where λ reaches it, as far as it does.
-                    forced = (row[i] == forced) & (opening >= -1e-6 * jnp.abs(slopes[k]))
-                    goes = jnp.where(leaves[k] == 0, goes, forced)
-                    bound = model.bound(k)
-                    left = (came[k] != 0) & (s[k] * came[k].astype(t.dtype) >= (1 - nearly(t)) * bound)
-                    attracts = (slopes[k] < 0) | (came[k] == 0) | _grips(model, k, s[k])
-                    sticks = (jnp.abs(s[k]) <= (1 + nearly(t)) * bound) & (leaves[k] == 0) & attracts & ~left
-                else:
-                    crosses = (leaves[k] != 0) & (came[k] != 0)
-                    unmoved = jnp.where(came[k] == 0, 1, came[k])
-                    onward = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
-                    goes = row[i] == jnp.where(crosses, -came[k], onward)
-                    sticks = jnp.zeros((), bool)
-                law = jnp.where(stays, sticks, goes)
-            # A switch that is not at its surface has no choice: its first option stands for what it is.
-            valid = valid & jnp.where(at[k], law, row[i] == options[i][0])
-            held = held + (at[k] & stays).astype(jnp.int32)
-            if k in model.holdable:
-                kept = kept + (at[k] & stays & model.held(k, came[k])).astype(jnp.int32)
-        return valid, held, kept
-
-    valid, held, kept = jax.vmap(judge)(jnp.asarray(table))
-    most = jnp.max(jnp.where(valid, held, -1))
-    several = jnp.sum(valid & (held == most)) > 1
-    score = jnp.where(valid & (held == most), kept, -1)
+    table = jnp.asarray(np.array(list(itertools.product(*options)), np.int32))
+    found = jax.vmap(ft.partial(judge, here, trial, noise))(table)
+    # A switch that is not at its surface has no choice: its first option stands for what it is.
+    at = jnp.stack([here.at[k] for k in which])
+    real = jnp.all(at | (table == np.array([o[0] for o in options], np.int32)), axis=1)
+    score = jnp.where(found.valid & real, found.rank, -1)
     best = jnp.argmax(score)
-    out = {k: jnp.where(at[k], jnp.asarray(table)[best, i], trial[k]).astype(jnp.int32) for i, k in enumerate(which)}
-    return trial | out, several, jnp.sum(score == score[best]) != 1
+    seen = jax.tree.map(lambda x: x[best], found.seen)
+    others = _elsewhere(here, table[best], seen, table, found.sound[best] & found.clear & real)
+    out = {k: jnp.where(here.at[k], table[best, i], trial[k]).astype(jnp.int32) for i, k in enumerate(which)}
+    return trial | out, seen, others, jnp.sum(score == score[best]) != 1
 
 
-def _pinned(model: Model, t: Scalar, y: Y, state: State, at: dict, leaves: dict, trial: dict, rates: dict) -> dict:
+def _guess(here: Instant, trial: dict, seen: Look) -> dict:
+    """What is held as a first guess: all but what leaves, what repels, and what cannot be held."""
+    model, at, came, leaves, out = here.model, here.at, here.came, here.leaves, dict(trial)
+    for k in here.which:
+        if k in (here.given or ()):
+            out[k] = came[k]
+        elif here.dry(k):
+            side, repels = here.side(k, seen.slopes[k]), seen.slopes[k] >= 0
+            passes = repels & (came[k] != 0) & ~here.grips(k, seen.s[k])
+            out[k] = jnp.where(at[k] & (side != 0), side, jnp.where(at[k] & passes, -came[k], trial[k]))
+        elif k not in model.contacts:
+            unmoved = jnp.where(came[k] == 0, 1, came[k])
+            side = jnp.where(seen.rates[k] == 0, unmoved, jnp.sign(seen.rates[k]).astype(jnp.int32))
+            # It cannot but cross; at a double root the sign of dh/dt is rounding.
+            side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
+            out[k] = jnp.where(at[k], side, came[k])
+    return out
+
+
+def _alone(
+    here: Instant, trial: dict, seen: Look, noise: dict
+) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
+    """The same as `_best` for one switch, which has no choice."""
+    ((k, at),) = here.at.items()
+    first = _guess(here, trial, seen)
+    trial = _amend(here, first, here.look(first), noise)[0]
+    forked = jnp.zeros((), bool)
+    if here.dry(k):
+        held = _either(seen.s[k], here.model.bound(k), seen.slopes[k])
+        forked = at & here.fresh(k) & (here.leaves[k] == 0) & held
+    return trial, here.look(trial), forked[None], jnp.zeros((), bool)
+
+
+def _either(multiplier: Scalar, bound: Any, slope: Scalar) -> Bool[Array, ""]:
+    """Whether a surface can hold the solution (|λ| <= b) and let it go as well: because it repels, or because |λ| > 1,
+    so that on both sides the fields point the same way."""
+    size = jnp.abs(multiplier)
+    return (size <= bound) & ((slope > 0) | (size > 1 + nearly(size)))
+
+
+def _search(
+    here: Instant, trial: dict, seen: Look, noise: dict
+) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
+    """The same for so many that not every assignment can be tried."""
+    which, came = here.which, here.came
+    trial = _guess(here, trial, seen)
+    # A bound that is reached together with that of another switch is left with it, not in a second event.
+    leaves = dict(here.leaves)
+    for k in which:
+        if here.dry(k):
+            over = seen.s[k] * came[k].astype(here.t.dtype) / here.model.bound(k) - 1
+            tied = here.open(k) & (came[k] != 0) & (seen.slopes[k] < 0) & (leaves[k] == 0)
+            tied = tied & (jnp.abs(over) <= nearly(over))
+            leaves[k] = jnp.where(tied, came[k], leaves[k])
+            trial[k] = jnp.where(tied, came[k], trial[k])
+    here = here._replace(leaves=leaves)
+
+    # One release or taking back a round, until nothing is violated; so many rounds do for all to change twice.
+    def amend(carry: tuple) -> tuple:
+        count, trial, _ = carry
+        return count + 1, *_amend(here, trial, here.look(trial), noise)
+
+    def unsettled(carry: tuple) -> Bool[Array, ""]:
+        count, _, wrong = carry
+        return wrong & (count < 2 * len(which) + 2)
+
+    trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
+    begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
+    _, trial, wrong = lax.while_loop(unsettled, amend, begin)
+    # Of all other assignments those in which one switch, or one group on surfaces that coincide, is let go or held.
+    chosen, seen, table = jnp.stack([trial[k] for k in which]), here.look(trial), []
+    for i, k in enumerate(which):
+        for value in (0, 1, -1) if here.dry(k) else ():
+            row = list(chosen)
+            row[i] = jnp.asarray(value, jnp.int32)
+            for pair, (same, ratio) in here.pairs.items():
+                a, b = (here.model.holdable[n] for n in pair)
+                if k in (a, b):
+                    n = which.index(b if k == a else a)
+                    row[n] = jnp.where(same, ratio.astype(jnp.int32) * value, row[n])
+            table.append(jnp.stack(row))
+    table = jnp.stack(table) if table else chosen[None]
+    clear = jax.vmap(ft.partial(judge, here, trial, noise))(table).clear
+    at = jnp.stack([here.at[k] for k in which])
+    real = jnp.all(at | (table == chosen), axis=1)
+    return trial, seen, _elsewhere(here, chosen, seen, table, clear & real), wrong
+
+
+def _pinned(here: Instant, trial: dict, rates: dict) -> dict:
     """A `sgn` switch at its surface that a contact keeps there, whatever its own value, is neither side's. (One that
     has just reached its bound has dh/dt = 0 too.)"""
-    held = state._replace(mode=tuple(trial.values()))
-    s = model.values(t, y, held)
-    _, matrix = model.linear(t, y, held, s)
+    model = here.model
+    held, s = here.values(trial)
+    _, matrix = model.linear(here.t, here.y, held, s)
     out = dict(trial)
     for i, k in enumerate(model.holdable):
         if k in model.contacts:
             continue
         pull = sum(
-            jnp.where(at[c] & (trial[c] == 1), jnp.abs(matrix[i, j] * s[c]), 0)
+            jnp.where(here.at[c] & (trial[c] == 1), jnp.abs(matrix[i, j] * s[c]), 0)
             for j, c in enumerate(model.holdable)
             if c in model.contacts
         )
-        pinned = at[k] & (leaves[k] == 0) & (pull > 0) & (jnp.abs(rates[k]) <= 1e-10 * pull)
+        pinned = here.open(k) & (here.leaves[k] == 0) & (pull > 0) & (jnp.abs(rates[k]) <= 1e-10 * pull)
         out[k] = jnp.where(pinned, 0, trial[k]).astype(jnp.int32)
     return out
 
 
-def _amend(
-    model: Model, which: tuple, at: dict, leaves: dict, trial: dict, seen: tuple, noise: dict
-) -> tuple[dict, Bool[Array, ""]]:
+def _amend(here: Instant, trial: dict, seen: Look, noise: dict) -> tuple[dict, Bool[Array, ""]]:
     """One release, or one taking back, of the switch that violates its law most."""
-    s, rates, slopes = seen
+    model, which = here.model, here.which
+    s, rates, slopes, _ = seen
     excess, opposed = [], []
     for k in which:
-        held = at[k] & model.held(k, trial[k]) if k in model.holdable else jnp.zeros((), bool)
+        held = here.open(k) & model.held(k, trial[k]) if k in model.holdable else jnp.zeros((), bool)
         if k in model.contacts:
             over, against = -s[k] * slopes[k] - noise[k], -rates[k]
         else:
@@ -266,7 +300,7 @@ def _amend(
             against = -rates[k] * trial[k].astype(rates[k].dtype)
         excess.append(jnp.where(held, over, -1))
         # What has just left has its λ at the bound (or it crosses): dh/dt may be zero but for rounding.
-        free = at[k] & ~held & (trial[k] != 0 if k not in model.contacts else True) & (leaves[k] == 0)
+        free = here.open(k) & ~held & (trial[k] != 0 if k not in model.contacts else True) & (here.leaves[k] == 0)
         opposed.append(jnp.where(free & (against > 1e-10 * jnp.abs(slopes[k])), against, 0))
     worst = jnp.stack(excess)
     back = jnp.stack(opposed)
@@ -282,4 +316,10 @@ def _amend(
             taken = jnp.where(slopes[k] < 0, 0, -trial[k])
             side = jnp.where((s[k] >= 0) == (slopes[k] < 0), 1, -1)  # where dh/dt = slope (s - λ) points
         out[k] = jnp.where(first, side, jnp.where(again, taken, trial[k])).astype(jnp.int32)
-    return out, release | retake
+    # Surfaces that coincide are left and held together.
+    moved = dict(out)
+    for (i, j), (same, ratio) in here.pairs.items():
+        for k, other in ((model.holdable[i], model.holdable[j]), (model.holdable[j], model.holdable[i])):
+            follows = same & (out[k] != trial[k]) & here.open(other)
+            moved[other] = jnp.where(follows, ratio.astype(jnp.int32) * out[k], moved[other]).astype(jnp.int32)
+    return moved, release | retake

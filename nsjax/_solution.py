@@ -155,10 +155,16 @@ class Solution(Shown, Generic[StateT]):
     - `events`: the event log.
     - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`, `num_events`.
     - `result`: `RESULTS`; why it ended.
-    - `unique`: False where it is known not to be the only solution of the inclusion: its start, or an arrival at a
-        surface, lies where a surface may hold the solution as well as let it go (repulsion sliding, chosen by `mode`;
-        example 2.5; static friction that holds with |λ| > 1), or it runs backwards and slides or rests. Derivatives are
-        those among solutions of the same choice.
+    - `unique`: whether it is known to be the only solution of the inclusion with static friction (|λ| <= b while it
+        holds) that sets out from its start and from each of its events: of all assignments of {hold, +1, -1} to the
+        `sgn` switches at their surfaces (contacts: {rest, lift off}) it took the only one in which each that holds has
+        |λ| <= b and each other one moves to its side. So it is False after a start or an arrival where a surface may
+        hold as well as let go (repulsion sliding, chosen by `mode`, example 2.5; static friction that holds with
+        |λ| > 1), behind a two-fold (where the surface that it slides on has come to repel), and if it runs backwards
+        and slides or rests. That static friction which holds goes on doing so until |λ| = b is its law, no choice; how
+        elements on coinciding surfaces share their load is no matter, since the motion is the same. Where five or more
+        switches are at their surfaces, only assignments are looked at that differ in one of them. Derivatives are those
+        among solutions of the same choice.
 
     - `margin`: how near it came to an event that did not happen: the least value of an indicator function (or of a
         multiplier's distance from its bound) that fell and rose again, over what an error of the state by the

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from ._filippov import Model, State
+from ._linear import nearly
 from ._results import RESULTS
-from ._settle import forks, nearly, settle
+from ._settle import settle
 from ._system import frozen, impact, relay, sgn
 from ._types import Scalar, Y
 
@@ -20,7 +21,7 @@ def start_mode(
 ) -> tuple[State, Bool[Array, ""], RESULTS]:
     """The mode in which the solution sets out: from the signs of h, from `mode=`, and on a surface by the fields; and
     whether another solution sets out there too. `horizon`: for how long it is to be solved."""
-    modes, parts, roots, at = [], [], [], {}
+    modes, parts, roots, at, chosen = [], [], [], {}, []
     result = RESULTS.successful
     on, beyond = {}, {}
     counts = model.counts(t)
@@ -70,8 +71,8 @@ def start_mode(
             # A state taken from an earlier solution may carry some drift off its surface.
             beyond[k] = jnp.where(mode == 0, jnp.abs(h), -mode.astype(h.dtype) * h) - 1e6 * noise
             modes.append(mode)
-            at[k] = jnp.zeros((), bool)
-            on[k] = mode.astype(h.dtype) * h <= noise
+            chosen.append(k)
+            at[k] = on[k] = mode.astype(h.dtype) * h <= noise
         else:
             modes.append(jnp.where(on[k], 0, jnp.sign(h)).astype(jnp.int32))
             at[k] = on[k]
@@ -90,8 +91,8 @@ def start_mode(
         off = gap > soon * jnp.abs(frozen(model.approach(k, t, y, state)))
         failure = RESULTS.start_penetrates if isinstance(model.switches[k], impact) else RESULTS.wrong_mode
         result = RESULTS.where(off, failure, result)
-    forked = _forked(model, t, y, state, on)
-    state, unsure, _, wrong = settle(model, t, y, state, at, {k: jnp.zeros((), jnp.int32) for k in at})
+    leaves = {k: jnp.zeros((), jnp.int32) for k in at}
+    state, unsure, forked, wrong = settle(model, t, y, state, at, leaves, tuple(chosen))
     for k in model.holdable:  # see `land`
         forked = forked | (model.held(k, state.mode[k]) & (model.direction < 0))
     result = RESULTS.where(unsure, RESULTS.repulsive_sliding, result)
@@ -102,27 +103,13 @@ def start_mode(
     for k, value in enumerate(frozen(model.values(t, y, state))):
         if model.static(k) and k in model.holdable:
             edge = jnp.where(model.direction < 0, model.edge(k, value, nearly(t)), 0)
-            roots[k] = jnp.where((state.mode[k] == 0) & ~at[k], edge, roots[k])
+            roots[k] = jnp.where((state.mode[k] == 0) & ((k in chosen) | ~at[k]), edge, roots[k])
     for k, here in on.items():
         rate = model.approach(k, t, y, state)
         sign = 1 - state.mode[k] if isinstance(model.switches[k], impact) else state.mode[k]
         part = 0 if state.part[k] is None else state.part[k]
         size = model.sizes(lambda t, y, k=k: model.h(k, t, y), t, y, jnp.ones_like(t), f)[part]
         fresh = jnp.where(jnp.abs(rate) > jnp.sqrt(jnp.finfo(t.dtype).eps) * size, 1, 2)
-        settled = at.get(k, jnp.zeros((), bool))
+        settled = jnp.zeros((), bool) if k in chosen else at.get(k, jnp.zeros((), bool))
         roots[k] = jnp.where(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
     return state._replace(roots=tuple(roots)), forked, result
-
-
-def _forked(model: Model, t: Scalar, y: Y, state: State, on: dict[int, Bool[Array, ""]]) -> Bool[Array, ""]:
-    """Whether one of the surfaces on which the start lies (`on`) can hold the solution as well as let it go."""
-    dry = [(i, k) for i, k in enumerate(model.holdable) if k not in model.contacts]
-    if not dry:
-        return jnp.zeros((), bool)
-    held = list(state.mode)
-    for _, k in dry:
-        held[k] = jnp.where(on[k], 0, state.mode[k])
-    trial = state._replace(mode=tuple(held))
-    s = model.values(t, y, trial)
-    _, matrix = model.linear(t, y, trial, s)
-    return jnp.stack([on[k] & forks(model, k, s[k], matrix[i, i]) for i, k in dry]).any()

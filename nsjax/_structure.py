@@ -90,3 +90,16 @@ def may_jump(fn: Callable[[Any], Any], x: Any) -> bool:
     met: list[str] = []
     _masks(jaxpr, [np.ones(v.aval.shape, bool) for v in jaxpr.invars], met)
     return bool(met)
+
+
+def dependence(fn: Callable[[Any], Any], x: Any) -> np.ndarray:
+    """Which results of `fn`, scalars, may depend on which numbers of `x`: booleans `(results, numbers)`."""
+    jaxpr = jax.make_jaxpr(fn)(x).jaxpr
+    none = [np.zeros(v.aval.shape, bool) for v in jaxpr.invars]
+    columns = []
+    for n, mask in enumerate(none):
+        for i in np.ndindex(mask.shape):
+            marked = mask.copy()
+            marked[i] = True
+            columns.append([m.any() for m in _masks(jaxpr, [*none[:n], marked, *none[n + 1 :]])])
+    return np.array(columns, bool).reshape(len(columns), len(jaxpr.outvars)).T

@@ -15,7 +15,6 @@ from jaxtyping import Array, Float, Int
 
 from ._crossing import binomials
 from ._filippov import Model, State
-from ._linear import linear_solve
 from ._series import Coefficient, Series
 from ._step import jittered, Step, Stepper, unresolved, Watch, with_multipliers
 from ._types import Scalar, Y
@@ -174,13 +173,12 @@ class TaylorStepper(Stepper):
         leaves, tree = jax.tree.flatten(y)
         which = model.holdable
         s = model.values(t, y, state)
-        held, inverse = None, None
+        inverse = None
         if which:
-            held = [model.held(k, state.mode[k]) for k in which]
+            held = jnp.stack([model.held(k, state.mode[k]) for k in which])
             _, slope = model.linear(t, y, state, s)
-            slope = jnp.where(jnp.stack(held)[:, None], slope, jnp.eye(len(which), dtype=t.dtype))
-            columns = jax.vmap(linear_solve, in_axes=(None, 0))(slope, jnp.eye(len(which), dtype=t.dtype))
-            inverse = 1 / slope if len(which) == 1 else columns.T
+            eye = jnp.eye(len(which), dtype=t.dtype)
+            inverse = jax.vmap(model.multipliers, in_axes=(None, 0, None), out_axes=1)(slope, eye, held)
 
         def fn(t: Scalar, *args: Array) -> list[Array]:
             y, s = jax.tree.unflatten(tree, args[: len(leaves)]), self.values(model, state, t, args[len(leaves) :])
@@ -188,9 +186,8 @@ class TaylorStepper(Stepper):
             return [*jax.tree.leaves(model.field(t, y, s)), *rates]
 
         def correct(rates: list[Coefficient]) -> list[Coefficient]:
-            assert held is not None and inverse is not None
-            known = [None if r is None else jnp.where(h, r, 0) for h, r in zip(held, rates)]
-            rows = [[inverse[i, j] * r for j, r in enumerate(known) if r is not None] for i in range(len(which))]
+            assert inverse is not None
+            rows = [[inverse[i, j] * r for j, r in enumerate(rates) if r is not None] for i in range(len(which))]
             return [-sum(row[1:], row[0]) if row else None for row in rows]
 
         ys, sigma = _expand(fn, t, leaves, [s[k] for k in which], correct, self.degree)

@@ -251,17 +251,16 @@ class _Exact:
         self.fields[mode] = _Field(M, L, tuple(guards), rows, h, expm(M * h), np.stack(taylor, 1))
         return self.fields[mode]
 
-    def settle(self, z: np.ndarray, mode: tuple, at: set[int], leaves: dict[int, int]) -> tuple:
+    def settle(self, z: np.ndarray, mode: tuple, here: set[int], leaves: dict[int, int]) -> tuple:
         """The assignment of stick and slip to the switches at their surfaces that satisfies all laws, by trying all."""
         valid = []
-        at = sorted(at)
+        at = sorted(here)
         options = []
         for k in at:
             if self.kinds[k] == "impact":
                 options.append((0,) if k in leaves else (1, 0))
                 continue
-            attracts = self.case.G[k] @ self.D[:, k] < 0
-            options.append((leaves[k],) if k in leaves else (0, 1, -1) if attracts else (1, -1))
+            options.append((1, -1) if k in leaves else (0, 1, -1))
         for choice in itertools.product(*options):
             trial = list(mode)
             for k, s in zip(at, choice):
@@ -274,7 +273,9 @@ class _Exact:
                         slack.append(L[k] @ z if s else self.level[k] @ M @ z)
                 elif s == 0:
                     slack.append(1 - abs(L[k] @ z) / self.case.bound[k])
-                elif k not in leaves or self.case.bound[k] > 1:  # else dh/dt = 0 at this instant
+                elif k in leaves and self.pull(k, tuple(trial)) < 0 and self.case.bound[k] == 1:
+                    slack.append(1.0 if s == leaves[k] else -1.0)  # dh/dt = 0 at this instant
+                else:
                     slack.append(s * (self.case.G[k] @ M @ z))
             least = min(slack, default=1.0)
             if abs(least) < 1e-5:
@@ -283,12 +284,30 @@ class _Exact:
                 valid.append(tuple(trial))
         if not valid:
             raise Unsolvable
-        # With b > 1 stick and slip may both be possible; then it sticks.
-        stuck = [sum(self.holds(k, v) for k in at) for v in valid]
-        best = [v for v, s in zip(valid, stuck) if s == max(stuck)]
-        if len(best) > 1:
+
+        # With b > 1, or where a surface repels, stick and slip may both be possible; then it sticks, but for what
+        # arrives at a surface that repels; and of others it keeps what stuck, and crosses.
+        def rank(trial: tuple) -> tuple:
+            arrived = [k for k in at if self.kinds[k] == "sgn" and mode[k] != 0]
+            stuck = [k for k in at if self.holds(k, trial)]
+            repelled = any(trial[k] == 0 and self.pull(k, trial) > 0 for k in arrived)
+            kept, crossed = (
+                sum(test) for test in ([self.holds(k, mode) for k in stuck], [trial[k] == -mode[k] for k in arrived])
+            )
+            return not repelled, len(stuck), kept, crossed
+
+        best = sorted(valid, key=rank)
+        if len(best) > 1 and rank(best[-1]) == rank(best[-2]):
             raise Sensitive("not unique")
-        return best[0]
+        return best[-1]
+
+    def pull(self, k: int, mode: tuple) -> float:
+        """What the value of a switch adds to dh/dt while all others that hold do so: below 0 if its surface attracts."""
+        others = [j for j in range(len(mode)) if self.holds(j, mode) and j != k]
+        effect = self.level[[k, *others]] @ self.D[:, [k, *others]]
+        if not others:
+            return effect[0, 0]
+        return effect[0, 0] - effect[0, 1:] @ np.linalg.solve(effect[1:, 1:], effect[1:, 0])
 
     def next_root(self, field: _Field, z: np.ndarray, limit: float, known: dict) -> tuple[float, tuple[int, int]]:
         """The first event of an arc no longer than `limit`: after how long, and of which guard."""

@@ -34,6 +34,8 @@ ORDER = (
     "_solution",
     "_sensitivity",
     "_save",
+    "_attraction",
+    "_laws",
     "_settle",
     "_event",
     "_check",

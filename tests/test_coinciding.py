@@ -1,0 +1,300 @@
+"""Several friction elements on one velocity, item 9 and pitfall 37: only the sum of their forces is determined, so that
+they must move as one element does whose strength is the sum of theirs."""
+
+import functools
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+from models import flat, itinerary, Motion, pid, times
+
+import nsjax
+from nsjax import RESULTS, solve
+
+
+class Loads(NamedTuple):
+    x: Array
+    v: Array
+    spent: Array  # ∫ s dt of each element
+
+
+class Belt(nsjax.System):
+    """x'' = a cos t - x - Σ F_i s_i, s_i in Sgn(c_i (v - v_dr)) with |λ_i| <= b_i."""
+
+    F: Array
+    b: Array
+    c: Array
+    a: float = 0.0
+    v_dr: float = 0.2
+    tuples: tuple[int, ...] = eqx.field(static=True, default=())  # the elements that have a corner, far away
+
+    @property
+    def switches(self):
+        return _elements(self.F.shape[0], self.tuples)
+
+    def vector_field(self, t, y, s):
+        values = jnp.stack([s[k.name] for k in self.switches])
+        return Loads(y.v, self.a * jnp.cos(t) - y.x - self.F @ values, values)
+
+
+@functools.cache
+def _elements(m, tuples) -> tuple[Any, ...]:
+    def element(i):
+        def guard(self, t, y):
+            h = self.c[i] * (y.v - self.v_dr)
+            return (h + 50 * self.c[i], h, h + 60 * self.c[i]) if i in tuples else h
+
+        return nsjax.sgn(guard, name=f"e{i}").breakaway(lambda self: self.b[i])
+
+    return tuple(element(i) for i in range(m))
+
+
+class One(nsjax.System):
+    """The same with one element."""
+
+    F: float
+    b: float
+    a: float = 0.0
+    v_dr: float = 0.2
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, self.a * jnp.cos(t) - y.x - self.F * s.belt)
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y.v - self.v_dr
+
+    @belt.breakaway
+    def belt(self):
+        return self.b
+
+
+TIGHT = dict(stepsize_controller=pid(1e-10), max_events=32)
+STARTS = {"slipping": (2.5, -0.5), "sticking": (0.3, 0.2), "at the bound": (-1.5, 0.2), "beyond it": (1.9, 0.2)}
+GROUPS = {
+    "alike": ([0.75, 0.75], [1.0, 1.0], [1.0, 1.0]),
+    "two": ([1.0, 0.5], [1.0, 1.0], [1.0, 2.0]),
+    "static": ([1.0, 0.5], [1.0, 2.0], [1.0, 1.0]),
+    "static, in other units": ([1.0, 0.5], [1.6, 1.2], [1.0, 1e-6]),
+    "small": ([1.0, 0.5], [1.0, 1.2], [1e-12, 1e-12]),
+    "large": ([1.0, 0.5], [1.0, 1.2], [1e12, 1e12]),
+    "small and large": ([1.0, 0.5], [1.0, 1.2], [1e-12, 1e12]),
+    "three": ([0.3, 0.5, 0.7], [1.0, 1.5, 1.2], [1.0, -1.0, 3.0]),
+    "five": ([0.3, 0.1, 0.7, 0.2, 0.2], [1.0, 1.5, 1.2, 1.0, 1.0], [1.0, 2.0, 3.0, 1e-6, 1.0]),
+}
+
+
+def group(name, a=0.0, **kwargs):
+    """Elements, with the sign with which each resists; and the single one that is equal to them."""
+    F, b, c = map(np.array, GROUPS[name])
+    many = Belt(*map(jnp.asarray, (F * np.sign(c), b, c)), a=a, **kwargs)
+    return many, One(float(F.sum()), float(F @ b / F.sum()), a=a)
+
+
+def start(system, x, v):
+    return Loads(jnp.asarray(x), jnp.asarray(v), jnp.zeros(system.F.shape))
+
+
+@functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+def run(many, one):
+    """From all starts: what is asked of the elements, and of the one that is equal to them."""
+
+    def told(sol):
+        e = sol.events
+        return sol.result == RESULTS.successful, sol.unique, sol.mode0, e.num, e.t, e.mode_after, sol.y1.x, sol.y1.v
+
+    def both(x, v):
+        y0 = Loads(x, v, jnp.zeros(many.F.shape)), Motion(x, v)
+        return [told(solve(m, 0.0, 40.0, y, throw=False, **TIGHT)) for m, y in zip((many, one), y0)]
+
+    return jax.vmap(both)(*jnp.asarray(list(STARTS.values())).T)
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "five")) for n in GROUPS])
+def test_elements_that_move_as_one(name):
+    """Same events at the same times, one of them for all elements; same motion; and as unique."""
+    many, one = group(name, a=0.4)
+    (fine, unique, mode0, num, t, modes, x, v), want = jax.tree.map(np.asarray, run(many, one))
+    signs = np.sign(np.asarray(many.c)).astype(int)
+    assert np.all(fine) and np.all(num > 0)
+    np.testing.assert_array_equal(unique, want[1])
+    np.testing.assert_array_equal(mode0, signs * want[2])
+    np.testing.assert_array_equal(num, want[3])
+    np.testing.assert_allclose(t, want[4], atol=1e-8)
+    np.testing.assert_array_equal(np.where(modes == -128, 0, modes), np.where(want[5] == -128, 0, signs * want[5]))
+    np.testing.assert_allclose([x, v], want[6:], atol=1e-8)
+
+
+def test_shares():
+    """While they stick λ_i = θ b_i, each in the direction in which it resists: ∫λ_i dt over a stick phase, here from
+    x = -1 to 1 with θ = -x / ΣF b, and the same whatever the order of declaration."""
+    F, b, c = map(np.array, GROUPS["three"])
+    F = F * np.sign(c)
+    t1 = 6.0
+    for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
+        system = Belt(*(jnp.asarray(a[order]) for a in (F, b, c)))
+        sol = solve(system, 0.0, t1, start(system, -1.0, 0.2), **TIGHT)
+        assert len(sol.events) == 0
+        theta = (1.0 * t1 - 0.1 * t1**2) / np.sum(abs(F) * b)
+        np.testing.assert_allclose(sol.y1.spent, (theta * b * np.sign(c))[order], atol=1e-12)
+
+
+@pytest.mark.parametrize("solver", [dfx.Tsit5(), nsjax.Taylor(), nsjax.Exponential(), dfx.Kvaerno5()])
+def test_other_methods(solver):
+    many, one = group("static")
+    y0 = (2.5, -0.5)
+    options = dict(solver=solver, max_steps=20_000)
+    sol = solve(many, 0.0, 20.0, start(many, *y0), **options)
+    want = solve(one, 0.0, 20.0, Motion(*y0), solver=dfx.Dopri8(), **TIGHT)
+    np.testing.assert_allclose(times(sol), times(want), atol=1e-6)
+    np.testing.assert_allclose([sol.y1.x, sol.y1.v], flat(want.y1), atol=1e-6)
+
+
+@pytest.mark.parametrize("where", ["slipping", "sticking"])
+def test_derivatives_through_sticking(where):
+    """By parameters, strengths and start: those of the one element, and numbers."""
+    x, v = STARTS[where]
+
+    def many(p):
+        F, b = p[2:4], p[4:6]
+        system = Belt(F, b, jnp.asarray([1.0, 2.0]), a=p[6], v_dr=p[7])
+        return jnp.stack(solve(system, 0.0, 20.0, start(system, p[0], p[1]), **TIGHT).y1[:2])
+
+    def one(p):
+        F, b = p[2:4], p[4:6]
+        system = One(jnp.sum(F), F @ b / jnp.sum(F), a=p[6], v_dr=p[7])
+        return jnp.stack(solve(system, 0.0, 20.0, Motion(p[0], p[1]), **TIGHT).y1)
+
+    p = jnp.asarray([x, v, 1.0, 0.5, 1.0, 1.4, 0.3, 0.2])
+    got, want = jax.jacfwd(many)(p), jax.jacfwd(one)(p)
+    assert np.all(np.isfinite(got)) and np.max(np.abs(want)) > 0.1
+    np.testing.assert_allclose(got, want, atol=1e-6)
+    by_h = jax.jacfwd(
+        lambda c: solve(Belt(p[2:4], p[4:6], c), 0.0, 20.0, start(Belt(p[2:4], p[4:6], c), x, v), **TIGHT).y1.v
+    )
+    np.testing.assert_allclose(by_h(jnp.asarray([1.0, 2.0])), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("tuples", [(0,), (1,), (0, 1)])
+def test_one_component_of_a_corner(tuples):
+    """The surfaces coincide where a certain component of a tuple is the least."""
+    many, one = group("static", tuples=tuples)
+    for y0 in ((2.5, -0.5), (0.3, 0.2), (-1.0, 1.4)):
+        sol = solve(many, 0.0, 20.0, start(many, *y0), **TIGHT)
+        want = solve(one, 0.0, 20.0, Motion(*y0), **TIGHT)
+        assert sol.result == RESULTS.successful and len(sol.events) == len(want.events)
+        np.testing.assert_allclose(times(sol), times(want), atol=1e-8)
+        np.testing.assert_allclose([sol.y1.x, sol.y1.v], flat(want.y1), atol=1e-8)
+
+
+class Blocks(nsjax.System):
+    """Two blocks on a belt, coupled by a spring; on the first one two friction elements, or one as strong; between the
+    blocks another."""
+
+    F: Array
+    joint: float = 0.3
+    merged: bool = eqx.field(static=True, default=False)
+
+    @property
+    def switches(self):
+        return _on_blocks(self.merged)
+
+    def vector_field(self, t, y, s):
+        on_first = jnp.sum(self.F) * s.a if self.merged else self.F[0] * s.a + self.F[1] * s.b
+        spring = y.x[1] - y.x[0]
+        between = self.joint * s.c
+        return Motion(y.v, jnp.stack([-y.x[0] + spring - on_first + between, 0.5 * (-spring - between - 0.4 * s.d)]))
+
+
+@functools.cache
+def _on_blocks(merged) -> tuple[Any, ...]:
+    a = nsjax.sgn(lambda self, t, y: y.v[0] - 0.2, name="a")
+    b = nsjax.sgn(lambda self, t, y: 3 * (y.v[0] - 0.2), name="b")
+    c = nsjax.sgn(lambda self, t, y: y.v[1] - y.v[0], name="c")
+    d = nsjax.sgn(lambda self, t, y: y.v[1] + 0.1, name="d")
+    return (a, c, d) if merged else (a, b, c, d)
+
+
+def test_beside_other_surfaces():
+    """Two surfaces that coincide and two that do not, all of which act on one another."""
+    F = jnp.asarray([0.6, 0.4])
+    met = 0
+    for x, v in (
+        ([1.0, -1.0], [0.2, 0.2]),
+        ([2.0, 1.0], [0.0, 0.0]),
+        ([0.2, 0.1], [0.2, -0.1]),
+        ([-2.0, 2.0], [0.5, 1]),
+    ):
+        y0 = Motion(jnp.asarray(x), jnp.asarray(v, float))
+        sol, want = (solve(Blocks(F, merged=m), 0.0, 20.0, y0, **TIGHT) for m in (False, True))
+        assert sol.result == RESULTS.successful and sol.unique == want.unique
+        assert [[m[k] for k in "acd"] for m in sol.itinerary] == [[m[k] for k in "acd"] for m in want.itinerary]
+        assert all(m["a"] == m["b"] for m in sol.itinerary)
+        np.testing.assert_allclose(times(sol), times(want), atol=1e-7)
+        np.testing.assert_allclose(np.concatenate(sol.y1), np.concatenate(want.y1), atol=1e-7)
+        met += len(sol.events)
+    assert met > 20
+
+
+def test_effects_of_opposite_sign():
+    """An element that pushes along (anti-friction) takes its share of the load against its own direction: together they
+    hold until both are spent, |x| = F_1 + F_2, though beyond F_1 - F_2 they might slip: a static point of their own.
+    It is known to arrive there with |x| < F_1 - F_2 only from within; elsewhere there are two solutions."""
+    system = Belt(jnp.asarray([1.0, -0.5]), jnp.ones(2), jnp.ones(2))
+    inside = solve(system, 0.0, 30.0, start(system, 0.3, 0.2), **TIGHT)
+    alike = solve(One(0.5, 3.0), 0.0, 30.0, Motion(0.3, 0.2), **TIGHT)
+    beyond = solve(system, 0.0, 0.1, start(system, 1.0, 0.2), **TIGHT)
+    assert len(inside.events) >= 3
+    np.testing.assert_allclose(times(inside), times(alike), atol=1e-8)
+    np.testing.assert_allclose([inside.y1.x, inside.y1.v], flat(alike.y1), atol=1e-8)
+    assert not beyond.unique and list(beyond.mode1) == [0, 0]
+    assert not solve(One(0.5, 3.0), 0.0, 0.1, Motion(1.0, 0.2)).unique
+    one = times(inside)[0]
+    np.testing.assert_allclose(one, (1.5 - 0.3) / 0.2, rtol=1e-9)
+
+
+def test_parallel_effects_on_different_surfaces():
+    """v = 0 and x + v = 1 are pushed by the same forces, but cross each other: the multiplier matrix is singular, and
+    no split holds both but at rest, x = 1, v = 0."""
+
+    class Crossed(nsjax.System):
+        force: float
+
+        def vector_field(self, t, y, s):
+            return Motion(y.v, self.force - s.a - 0.3 * s.b)
+
+        @nsjax.sgn
+        def a(self, t, y):
+            return y.v - 0.5
+
+        @nsjax.sgn
+        def b(self, t, y):
+            return y.x + y.v - 1
+
+    # On v = 0.5 it passes x + v = 1 at t = 1: λ_a = force ± 0.3 before and after.
+    sol = solve(Crossed(0.2), 0.0, 2.0, Motion(0.0, 0.5), **TIGHT)
+    assert sol.result == RESULTS.successful and itinerary(sol) == [("b", -1, 1)]
+    np.testing.assert_allclose(times(sol), 1, atol=1e-9)
+    np.testing.assert_allclose(flat(sol.y1), [1, 0.5], atol=1e-9)
+    sol = solve(Crossed(0.2), 0.0, 2.0, Motion(0.5, 0.5), **TIGHT)
+    np.testing.assert_allclose(flat(sol.y1), [1.5, 0.5], atol=1e-9)
+
+
+def test_batch():
+    """Lanes with and without sticking."""
+    many, one = group("static")
+    x = jnp.linspace(-3.0, 3.0, 13)
+
+    def end(system, y0):
+        sol = solve(system, 0.0, 15.0, y0, **TIGHT, throw=False)
+        return sol.y1.x, sol.result == RESULTS.successful
+
+    got, fine = jax.vmap(lambda x: end(many, start(many, x, 0.2)))(x)
+    want, _ = jax.vmap(lambda x: end(one, Motion(x, jnp.asarray(0.2))))(x)
+    assert np.all(fine)
+    np.testing.assert_allclose(got, want, atol=1e-8)
