@@ -17,6 +17,7 @@ ORDER = (
     "_progress",
     "_bracket",
     "_linear",
+    "_minima",
     "_structure",
     "_system",
     "_parameter",
