@@ -143,6 +143,26 @@ def minima(
     return lax.while_loop(lambda walk: walk.begin < 1, step, start).minima
 
 
+def places_of(rows: list[list[Any]]) -> np.ndarray:
+    """In which order functions `[function][part]` stand in groups of as many parts."""
+    return np.argsort([len(row) for row in rows], kind="stable")
+
+
+def grouped(rows: list[list[Array]]) -> list[Array]:
+    """Functions `[function][part]` of times, in groups of as many parts."""
+    groups = []
+    for count in sorted({len(row) for row in rows}):
+        these = [jnp.stack(row, axis=1) for row in rows if len(row) == count]
+        groups.append(jnp.stack(these, axis=1))
+    return groups
+
+
+def in_order(found: Minima, places: np.ndarray) -> Minima:
+    """The same, but of the functions in the order in which they were grouped."""
+    back = np.argsort(places)
+    return found._replace(**{name: getattr(found, name)[back] for name in ("least", "share", "x", "most")})
+
+
 def _theta(phi: Array) -> Array:
     return 0.5 - 0.5 * jnp.cos(phi)
 

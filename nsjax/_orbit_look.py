@@ -246,30 +246,20 @@ def along_segment(
         end = jnp.where(last < 1, a + (b - a) * last, b)
         return curve.flow.along(a + (b - a) * first, end, x, value, state)
 
-    def rows(ts: Array, xs: Array) -> list[list[Array]]:
-        return jax.vmap(lambda t, x: curve.guard_rows(model, t, x, state))(ts, xs) if slots else []
+    def rows(t: Scalar, x: Array) -> list[list[Array]]:
+        guards = curve.guard_rows(model, t, x, state) if slots else []
+        return [*([x[i]] for i in range(n)), *([-x[i]] for i in range(n)), *guards]
 
-    # Guards that are the largest of several parts come last.
-    several = np.array([len(row) > 1 for row in jax.eval_shape(rows, a[None], x[None])], bool)
-    places = np.concatenate([np.arange(2 * n), 2 * n + np.argsort(several, kind="stable")])
+    places = places_of(jax.eval_shape(rows, a, x))
 
     def functions(ts: Array, xs: Array) -> tuple[list[Array], Array]:
-        guards = rows(ts, xs)
-        plain = [row[0][:, None] for row in guards if len(row) == 1]
-        groups = [jnp.concatenate([xs, -xs, *plain], axis=1)[..., None]]
-        if any(several):
-            joined = [row for row in guards if len(row) > 1]
-            width = max(map(len, joined))
-            groups.append(jnp.stack([jnp.stack(row + row[-1:] * (width - len(row)), 1) for row in joined], 1))
-        return groups, RESOLVED * slack[places]
+        return grouped(jax.vmap(rows)(ts, xs)), RESOLVED * slack[places]
 
     def below(most: Array) -> Array:
         # The least value of a guard is of interest where it is about to vanish.
-        return jnp.where(np.arange(len(places)) < 2 * n, jnp.inf if turns else -jnp.inf, 0.1 * most)
+        return jnp.where(places < 2 * n, jnp.inf if turns else -jnp.inf, 0.1 * most)
 
-    found = minima(sample, functions, x, orders[:, places], below)
-    back = np.argsort(places)
-    return found._replace(**{k: getattr(found, k)[back] for k in ("least", "share", "x", "most")})
+    return in_order(minima(sample, functions, x, orders[:, places], below), places)
 
 
 def zeros_at_begin(curve: OrbitCurve, model: Model, course: Course) -> Array:
