@@ -40,7 +40,7 @@ _SERIES = np.linalg.inv(np.cos(np.outer(_PHI, np.arange(NODES + 1))))
 # hides between them, and at the end, should the others do so by chance.
 _TAIL = _SERIES[[*range(NODES // 2 - 3, NODES // 2 + 1), *range(NODES - 3, NODES + 1)]]
 _BARYCENTRIC = (-1.0) ** np.arange(NODES + 1) * np.where(np.arange(NODES + 1) % NODES == 0, 0.5, 1)
-_LOCAL = np.arange(-3, 4)  # nodes through which a dip is a polynomial
+_LOCAL = np.arange(-5, 6)  # nodes through which a dip is a polynomial
 _TO_POWERS = np.linalg.inv(np.vander(_LOCAL, increasing=True))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 import reference
+import scipy.optimize
 from models import Hammer, Motion, pid, Plane
 
 import nsjax
@@ -280,6 +281,35 @@ def test_maximum():
     np.testing.assert_allclose(amplitude(p), exact(p), rtol=1e-11)
     np.testing.assert_allclose(jax.jit(jax.jacfwd(amplitude))(p), jax.grad(exact)(p), rtol=1e-9)
     np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(amplitude)))(p), jax.hessian(exact)(p), rtol=1e-7)
+
+
+class TwoTones(nsjax.System):
+    """A damped oscillator forced at frequencies 1 and 0.97: its orbit has a hundred peaks, of which none is another."""
+
+    c: jax.Array | float = 0.3
+    period = 200 * np.pi
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - self.c * y.v + 0.1 * (jnp.cos(t) + jnp.cos(0.97 * t)))
+
+
+def two_tones(t, c=0.3):
+    return sum((0.1 * np.exp(1j * w * t) / (1 - w**2 + 1j * c * w)).real for w in (1, 0.97))
+
+
+def test_maximum_of_many_peaks():
+    """Issue 20, item 4, and pitfall 41: no fixed number of samples decides which of a hundred peaks is the largest."""
+    orbit = find_orbit(TwoTones(), Motion(0.0, 0.3), max_steps=20000)
+    ts = np.linspace(0, 200 * np.pi, 2_000_001)
+    for sign in (1, -1):
+        top = ts[np.argmax(sign * two_tones(ts))]
+        found = scipy.optimize.minimize_scalar(lambda t: -sign * two_tones(t), bracket=(top - 1e-3, top, top + 1e-3))
+        np.testing.assert_allclose(orbit.maximum(lambda t, y: sign * y.x), -found.fun, rtol=1e-11)
+    # What it was by 65 samples and Newton's method.
+    assert np.max(orbit.path().y.x) < 0.98 * np.max(two_tones(ts))
+    # A kink where it is least harms nothing; nor does a quantity that does not change.
+    np.testing.assert_allclose(orbit.maximum(lambda t, y: jnp.abs(y.x)), np.abs(two_tones(ts)).max(), rtol=1e-9)
+    np.testing.assert_allclose(orbit.maximum(lambda t, y: 0 * y.x + 2), 2, rtol=1e-15)
 
 
 def test_maximum_of_an_orbit_that_sticks(classic):
