@@ -1,6 +1,7 @@
 """The ways in which a periodic orbit is searched for, one after the other."""
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 
 from ._cuts import cuts_from, cuts_near, Segment
-from ._guess import repeats, settle_down
+from ._guess import of_relays, repeats, settle_down, undecided
 from ._orbit import Orbit
 from ._segments import by_segments
 from ._shooting import shoot
@@ -47,31 +48,44 @@ class Search(NamedTuple):
         if system.period is None and period is None:
             return self._from_nothing(system, y0)
         if self.order is None and system.period is not None:
-            start, _, _ = self._settled(system, y0)
-            order = int(repeats(system, self.t0, start, self.sign, self.how))
-            return self._tries(system, start, jnp.ones_like(self.t0), order, None)
+            start, _, _, mode = self._settled(system, y0)
+            order = int(repeats(system, self.t0, start, self.sign, mode, self.how))
+            return self._tries(system, start, jnp.ones_like(self.t0), order, mode)
         period = jnp.asarray(1.0 if period is None else period, self.t0.dtype)
         if self.concrete and not period > 0:
             raise ValueError(f"Argument `period` must be positive, but got {period}.")
         order = self.order or 1
+        for mode in self._modes(system, y0):
+            orbit = self._once(system, y0, period, order, mode, None)
+            if bool(is_okay(orbit.result)):
+                return orbit
         orbit = self._tries(system, y0, period, order, self.mode)
         if self.concrete and not bool(is_okay(orbit.result) | (orbit.result == RESULTS.orbit_is_multiple_cover)):
-            start, period, rests = self._settled(system, y0)
+            start, period, rests, mode = self._settled(system, y0)
             if rests:
                 orbit = eqx.tree_at(lambda o: o.result, orbit, RESULTS.orbit_is_equilibrium)
             if period > 0:
-                second = self._tries(system, start, period, order, None)
+                second = self._tries(system, start, period, order, mode)
                 orbit = second if bool(is_okay(second.result)) else orbit
         return orbit
 
-    def _settled(self, system: System, y0: Y) -> tuple[Y, Scalar, Any]:
+    def _modes(self, system: System, y0: Y) -> Iterator[dict[str, Any]]:
+        """Where nothing is told of relays that are within their hysteresis, all modes in which they may be."""
+        if not self.concrete or self.method == "segments" or self.pieces != 1 or not of_relays(system, system.switches):
+            return
+        given = self.mode or {}
+        names = [k for k, open_ in undecided(system, self.t0, y0).items() if open_ and k not in given]
+        for values in itertools.product((0, 1), repeat=len(names)) if names else ():
+            yield given | {name: jnp.asarray(value, jnp.int32) for name, value in zip(names, values)}
+
+    def _settled(self, system: System, y0: Y) -> tuple[Y, Scalar, Any, Any]:
         return settle_down(frozen(system), self.t0, lax.stop_gradient(y0), self.sign, self.mode, self.how)
 
     def _from_nothing(self, system: System, y0: Y) -> Orbit:
         """Of an autonomous system, without a guess of the period."""
-        start, period, rests = self._settled(system, y0)
+        start, period, rests, mode = self._settled(system, y0)
         lost = ~(period > 0)
-        orbit = self._tries(system, start, jnp.where(lost, 1, period), 1, None)
+        orbit = self._tries(system, start, jnp.where(lost, 1, period), 1, mode)
         end = RESULTS.where(rests, RESULTS.orbit_is_equilibrium, RESULTS.orbit_not_found)
         return eqx.tree_at(lambda o: o.result, orbit, RESULTS.where(lost, end, orbit.result))
 

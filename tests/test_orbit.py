@@ -482,5 +482,39 @@ def test_the_mode_of_a_relay_comes_back():
     found = find_orbit(Feedback(), guess, t0=t0, mode={"r": 1}, **METHOD)
     assert int(found.mode[0]) == 1
     np.testing.assert_allclose(found.multipliers, orbit.multipliers, rtol=1e-8)
-    off = find_orbit(Feedback(), guess, t0=t0, mode={"r": 0}, method="shooting", throw=False, **METHOD)
+    # (Under `jit` there is one try; else another one follows, from where the solution settles.)
+    off = eqx.filter_jit(lambda y: find_orbit(Feedback(), y, t0=t0, mode={"r": 0}, throw=False, **METHOD))(guess)
     assert not bool(nsjax.is_okay(off.result))
+    assert int(find_orbit(Feedback(), guess, t0=t0, mode={"r": 0}, **METHOD).mode[0]) == 1
+    # Issue 20, item 12: it is found without being told.
+    alone = find_orbit(Feedback(), guess, t0=t0, **METHOD)
+    assert int(alone.mode[0]) == 1
+    np.testing.assert_allclose(alone.y0, found.y0, rtol=1e-9)
+
+
+class Thermostat(nsjax.System):
+    """Heats below 0.9 until 1.1, towards `heat`: an orbit that never leaves the hysteresis."""
+
+    heat: jax.Array | float
+
+    def vector_field(self, t, y, s):
+        return -y + self.heat * s.on
+
+    @nsjax.relay
+    def on(self, t, y):
+        return 0.9 - y
+
+    @on.off
+    def on(self, t, y):
+        return y - 1.1
+
+
+@pytest.mark.parametrize("heat", [1.5, 3.0])
+@pytest.mark.parametrize("period", [None, 0.5])
+def test_an_orbit_within_the_hysteresis(heat, period):
+    """Issue 20, item 12: the base point lies in the longer arc, whichever mode that is of. Both in closed form."""
+    on, off = np.log((heat - 0.9) / (heat - 1.1)), np.log(1.1 / 0.9)
+    for method in ("shooting", "segments"):
+        orbit = find_orbit(Thermostat(heat), jnp.asarray(1.0), period=period, method=method, **METHOD)
+        np.testing.assert_allclose(orbit.period, on + off, rtol=1e-10)
+        assert int(orbit.mode[0]) == (on > off)
