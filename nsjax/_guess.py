@@ -118,9 +118,33 @@ def settle_down(
     far = jnp.cumsum(gap > 0.3) > 0
     near = far & (gap < 0.1)
     low = near & (gap <= jnp.roll(gap, 1)) & (gap <= jnp.roll(gap, -1))
-    rests = (last.result == RESULTS.max_steps_reached) & (jnp.max(scale) <= 1e-4 * (1 + jnp.max(jnp.abs(here))))
+    ended = (last.result == RESULTS.max_steps_reached) | (last.result == RESULTS.successful)
+    rests = ended & (jnp.max(scale) <= 1e-4 * (1 + jnp.max(jnp.abs(here))))
     period = jnp.where(rests, 0, sign * (times[jnp.argmax(low)] - t0))
     return last.y1, period, rests, of_relays(system, last.mode1)
+
+
+@eqx.filter_jit
+def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
+    """Whether an equilibrium of the sliding field is one of a continuum: on the surfaces that hold it the derivative of
+    the field is singular."""
+    model = Model(system, jnp.ones_like(t0), t0, y)
+    state = at_start(model, t0, y)
+    x, unravel = jfu.ravel_pytree(y)
+    matrix = jax.jacfwd(lambda x: ravel(model.flow(t0, unravel(x), state)))(x)
+    size = jnp.max(jnp.abs(matrix))
+    sticks = jnp.zeros((), bool)
+    for k, switch in enumerate(model.switches):
+        if isinstance(switch, sgn):
+            held = state.mode[k] == 0
+            sticks = sticks | held
+            for i in range(model.parts[k]):
+                # Off the surface, where nothing is asked, it is made regular.
+                n = jax.grad(lambda x, k=k, i=i: model.h(k, t0, unravel(x))[i])(x)
+                n = n / jnp.where(jnp.any(n != 0), jnp.linalg.norm(n), 1)
+                matrix = matrix + jnp.where(held, size, 0) * jnp.outer(n, n)
+    values = jnp.linalg.svd(matrix, compute_uv=False)
+    return sticks & (values[-1] <= 1e-9 * values[0])
 
 
 def _laps(

@@ -518,3 +518,48 @@ def test_an_orbit_within_the_hysteresis(heat, period):
         orbit = find_orbit(Thermostat(heat), jnp.asarray(1.0), period=period, method=method, **METHOD)
         np.testing.assert_allclose(orbit.period, on + off, rtol=1e-10)
         assert int(orbit.mode[0]) == (on > off)
+
+
+class Held(nsjax.System):
+    """x'' = -x - 0.1 x' - sgn(x') + p(t), which comes to stick for ever."""
+
+    def push(self, t):
+        return 0.0
+
+    @nsjax.sgn
+    def friction(self, t, y):
+        return y.v
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - 0.1 * y.v - s.friction + self.push(t))
+
+
+class Driven(Held):
+    period = 2 * np.pi
+
+
+@pytest.mark.parametrize(
+    "system, guess",
+    [(Held(0.0), {}), (Held(0.0), dict(period=6.0)), (Driven(0.3), {})],
+    ids=["free", "period", "forced"],
+)
+@pytest.mark.parametrize("y0", [Motion(0.1, 0.0), Motion(3.0, 0.1)], ids=["at rest", "comes to rest"])
+def test_a_continuum_is_named(system, guess, y0):
+    """Issue 20, item 12: every x that friction can hold is an equilibrium, or an orbit."""
+    orbit = find_orbit(system, y0, throw=False, **guess, **METHOD)
+    assert orbit.result == RESULTS.orbit_sticks_for_ever and not bool(nsjax.is_okay(orbit.result))
+
+
+def test_an_equilibrium_that_slides_is_no_continuum():
+    """x' = -x on the surface y = 0 of y' = -sgn y: one point alone."""
+
+    class Sliding(nsjax.System):
+        @nsjax.sgn
+        def surface(self, t, y):
+            return y.v
+
+        def vector_field(self, t, y, s):
+            return Motion(-y.x, -s.surface)
+
+    orbit = find_orbit(Sliding(), Motion(1.0, 0.2), throw=False, **METHOD)
+    assert orbit.result == RESULTS.orbit_is_equilibrium
