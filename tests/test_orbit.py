@@ -537,10 +537,13 @@ class Held(nsjax.System):
 class Driven(Held):
     period = 2 * np.pi
 
+    def push(self, t):
+        return 0.3 * jnp.cos(t)
+
 
 @pytest.mark.parametrize(
     "system, guess",
-    [(Held(0.0), {}), (Held(0.0), dict(period=6.0)), (Driven(0.3), {})],
+    [(Held(), {}), (Held(), dict(period=6.0)), (Driven(), {})],
     ids=["free", "period", "forced"],
 )
 @pytest.mark.parametrize("y0", [Motion(0.1, 0.0), Motion(3.0, 0.1)], ids=["at rest", "comes to rest"])
