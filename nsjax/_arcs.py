@@ -1,5 +1,6 @@
 """The smooth arcs of an orbit, each followed in its own mode, whatever surfaces do to the flow."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -7,10 +8,12 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._filippov import Model, State
 from ._jacobian import dense_jacobian
+from ._minima import grouped, in_order, Minima, minima, places_of, THETA
 from ._results import is_okay
 from ._saltation import states
 from ._solve import solve
@@ -18,7 +21,8 @@ from ._system import System
 from ._types import Scalar, Y
 
 
-SAMPLES = 65  # of an arc, between which nothing is looked at
+SAMPLES = 65  # of an arc, to be drawn
+TRUSTED = 1e2  # dense output may err by so many tolerances of the steps
 
 
 class Arcs(NamedTuple):
@@ -106,6 +110,34 @@ class Flows(eqx.Module):
         ts, xs = self.rows(along, begin, end, x)
         return ts.reshape(len(begin), -1), xs.reshape(len(begin), -1, x.shape[-1])
 
+    def minima(
+        self, a: Scalar, b: Scalar, x: Array, state: State, functions: Callable[[Scalar, Array], list[list[Scalar]]],
+        below: Callable[[Array], Array],
+    ) -> Minima:  # fmt: skip
+        """The least values along a piece of functions `[function][part]` of time and state, each the largest of its
+        parts (`below` as for `minima`)."""
+        controller = dict(self.how)["stepsize_controller"]
+        rtol, atol = (getattr(controller, name, 0.0) for name in ("rtol", "atol"))
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], x.shape)
+        unit, _ = jfu.ravel_pytree(jax.tree.map(lambda y, tol: jnp.full_like(y, tol), self.y0, _spread(atol, self.y0)))
+        ratio, _ = jfu.ravel_pytree(jax.tree.map(lambda y, tol: jnp.full_like(y, tol), self.y0, _spread(rtol, self.y0)))
+
+        def sample(first: Scalar, last: Scalar, x: Array) -> tuple[Array, Array, tuple]:
+            begin, end = a + (b - a) * first, jnp.where(last < 1, a + (b - a) * last, b)
+            ts = jnp.clip(begin + (end - begin) * jnp.asarray(THETA, x.dtype), jnp.minimum(a, b), jnp.maximum(a, b))
+            return ts, self.piece(begin, end, x, state, dfx.SaveAt(ts=ts)), ()
+
+        def groups(ts: Array, xs: Array) -> tuple[list[Array], Array]:
+            near = xs + TRUSTED * jnp.asarray(signs, x.dtype) * (unit + ratio * jnp.abs(xs))
+            rows = jax.vmap(functions)(jnp.concatenate([ts, ts]), jnp.concatenate([xs, near]))
+            both = grouped(rows)
+            off = [jnp.max(jnp.abs(v[: len(ts)] - v[len(ts) :]), axis=(0, 2)) for v in both]
+            return [v[: len(ts)] for v in both], jnp.concatenate(off)
+
+        places = places_of(jax.eval_shape(functions, a, x))
+        orders = jnp.zeros((2, len(places)), x.dtype)
+        return in_order(minima(sample, groups, x, orders, below), places)
+
     def derivatives(self, begin: Array, end: Array, x: Array) -> tuple[Array, Float[Array, "rows pieces n n"]]:
         """The ends of all pieces, and their derivatives by the beginnings."""
 
@@ -131,6 +163,11 @@ class Flows(eqx.Module):
             return self.piece(starts[i], t, x.reshape(-1, x.shape[-1])[i], state, dfx.SaveAt(t1=True))[0]
 
         return jax.vmap(one)(times)
+
+
+def _spread(tolerance: Any, y: Y) -> Y:
+    """A tolerance for every leaf: it may be one for all."""
+    return jax.tree.map(lambda _: tolerance, y) if jax.tree.structure(tolerance).num_leaves < 2 else tolerance
 
 
 def flows_of(

@@ -17,6 +17,7 @@ from ._find_orbit import find_orbit
 from ._orbit import Orbit
 from ._orbit_curve import OrbitCurve
 from ._orbit_lane import EACH, ENDED, follow_lane, Lane, lane_tests, LOST, NO_ORBIT
+from ._orbit_look import extremes
 from ._orbit_start import check_precision, curve_and_start, options, order_of, phase_of
 from ._parameter import get_parameter, parameter_path, put_parameter
 from ._results import is_okay
@@ -192,14 +193,22 @@ class _Follow(eqx.Module):
     points: int = eqx.field(static=True)
 
     def __call__(self, lane: _Lane, good: Any, upwards: Any) -> Lane:
-        curve = dataclasses.replace(
-            self.curve,
-            model=eqx.tree_at(lambda m: m.system, self.curve.model, lane.system),
-            order=lane.order,
-            normal=lane.normal,
-            reference=lane.reference,
-        )
+        curve = _curve_of(self.curve, lane)
         return follow_lane(curve, lane.course, lane.u, good, upwards, self.max_step, self.points)
+
+
+class _Extremes(eqx.Module):
+    """One point of a lane."""
+
+    curve: OrbitCurve
+
+    def __call__(self, lane: _Lane, u: Any) -> tuple[Array, Array]:
+        return extremes(_curve_of(self.curve, lane), lane.course, u)
+
+
+def _curve_of(curve: OrbitCurve, lane: _Lane) -> OrbitCurve:
+    system = eqx.tree_at(lambda m: m.system, curve.model, lane.system)
+    return dataclasses.replace(curve, model=system, order=lane.order, normal=lane.normal, reference=lane.reference)
 
 
 def _gathered(curve: OrbitCurve, parameter: str, lanes: _Lane, found: Lane) -> OrbitBranches:
@@ -228,6 +237,10 @@ def _gathered(curve: OrbitCurve, parameter: str, lanes: _Lane, found: Lane) -> O
         return out if out.dtype == bool else np.where(real.reshape(real.shape + (1,) * (out.ndim - 2)), out, np.nan)
 
     rows = jax.tree.map(taken, found.rows)
+    low, high = (np.full((*real.shape, len(curve.sizes)), np.nan) for _ in range(2))
+    if real.any():
+        each = jax.tree.map(lambda leaf: leaf[np.nonzero(real)[0]], lanes)
+        low[real], high[real] = sweep(_Extremes(curve), each, rows.u[real])
 
     def as_states(x: np.ndarray) -> Any:
         return jax.tree.map(np.asarray, jax.vmap(jax.vmap(jfu.ravel_pytree(curve.like)[1]))(x))
@@ -240,8 +253,8 @@ def _gathered(curve: OrbitCurve, parameter: str, lanes: _Lane, found: Lane) -> O
         ts=rows.t,
         ys=as_states(rows.x),
         orders=lanes.order,
-        low=as_states(rows.low),
-        high=as_states(rows.high),
+        low=as_states(low),
+        high=as_states(high),
         multipliers=rows.multipliers,
         stable=rows.stable & real,
         kinds=words,

@@ -159,8 +159,7 @@ def cuts_near(
 ) -> tuple[Cuts, Bool[Array, ""]]:
     """The segments of the solution from a guess, and whether it came back to the mode in which it begins."""
     if system.period is None:
-        y0, period = base_point(system, t0, y0, period, 1.0, mode, how)
-        mode = None
+        y0, period, mode = base_point(system, t0, y0, period, 1.0, mode, how)
     else:
         period = jnp.asarray(system.period, t0.dtype) * order
     sol = solve(system, t0, t0 + period, y0, mode=mode, throw=False, **how)

@@ -8,12 +8,13 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 
-from ._arcs import Arcs, flows_of, SAMPLES
+from ._arcs import Arcs, flows_of
+from ._minima import NODES
 from ._system import frozen, System
 from ._types import Scalar, Y
 
 
-REFINEMENTS = 4  # steps of Newton's method from the largest sample: each doubles its digits
+REFINEMENTS = 2  # steps of Newton's method from where the polynomials are largest: each doubles its digits
 
 
 def largest(system: System, arcs: Arcs, how: tuple[tuple[str, Any], ...], fn: Callable[[Scalar, Y], Scalar]) -> Scalar:
@@ -21,18 +22,21 @@ def largest(system: System, arcs: Arcs, how: tuple[tuple[str, Any], ...], fn: Ca
     flows, x = flows_of(system, arcs, how)
     still, points = frozen((flows, x))
     unravel = jfu.ravel_pytree(flows.y0)[1]
-    ts, xs = still.paths(*frozen((arcs.begin, arcs.end)), points)
-    values = jax.vmap(jax.vmap(lambda t, x: fn(t, unravel(x))))(ts, xs)
-    row, sample = jnp.unravel_index(jnp.argmax(values), values.shape)
-    piece = sample // SAMPLES
-    share = (sample % SAMPLES).astype(ts.dtype) / (SAMPLES - 1)
+
+    def highest(a: Scalar, b: Scalar, x: Any, state: Any) -> tuple[Scalar, Scalar]:
+        found = still.minima(a, b, x, state, lambda t, x: [[-fn(t, unravel(x))]], lambda most: most + jnp.inf)
+        return -found.least[0], found.share[0]
+
+    values, shares = still.rows(highest, *frozen((arcs.begin, arcs.end)), points)
+    row, piece = jnp.unravel_index(jnp.argmax(values), values.shape)
+    share = shares[row, piece]
 
     def pick(tree: Any) -> Any:
         return jax.tree.map(lambda leaf: leaf[row], tree)
 
     def ends(arcs: Arcs) -> tuple[Scalar, Scalar]:
         begin, length = arcs.begin[row], (arcs.end[row] - arcs.begin[row]) / flows.pieces
-        return begin + piece.astype(ts.dtype) * length, length
+        return begin + piece.astype(length.dtype) * length, length
 
     def at(flows: Any, x: Any, arcs: Arcs, share: Scalar) -> tuple[Scalar, Scalar, Scalar]:
         """`fn` and its first two derivatives by time, a share of the way along the piece."""
@@ -55,8 +59,8 @@ def largest(system: System, arcs: Arcs, how: tuple[tuple[str, Any], ...], fn: Ca
     for _ in range(REFINEMENTS):
         _, slope, bend = at(still, points, calm, share)
         move = jnp.where(bend < 0, -slope / jnp.where(bend < 0, bend, 1), 0) / jnp.where(length > 0, length, 1)
-        # The samples have told where it is: no farther than to the next one.
-        share = jnp.clip(share + jnp.clip(move, -1 / (SAMPLES - 1), 1 / (SAMPLES - 1)), 0, 1)
+        # The polynomials have told where it is.
+        share = jnp.clip(share + jnp.clip(move, -1 / NODES, 1 / NODES), 0, 1)
     value, slope, bend = at(flows, x, arcs, frozen(share))
     inside = (share > 0) & (share < 1) & (bend < 0)
     # The place moves with the parameters, which matters from the second derivative on.

@@ -5,6 +5,7 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
@@ -20,14 +21,18 @@ from ._types import Scalar, Y
 from ._variational import arcs
 
 
+Relays = dict[str, Int[Array, ""]] | None
+
+
 def base_point(
     system: System, t0: Scalar, y0: Y, period: Scalar, sign: float, mode: Any, method: dict
-) -> tuple[Y, Scalar]:
+) -> tuple[Y, Scalar, Relays]:
     """A better guess, from the solution over two and a half guessed periods (backwards if `sign` is -1).
 
     The base point is in the middle of the longest arc between events, on a smooth one if there is any: the flow map is
     only one-sided differentiable at an event, and the phase condition wants a transversal section. The period is the
-    time after which the solution comes nearest to it again, among those within half the guess of it.
+    time after which the solution comes nearest to it again, among those within half the guess of it. Third, the modes
+    of relays there, which within a hysteresis only the solution knows.
     """
     end_time = t0 + sign * 2.5 * period
     method = method | dict(max_events=3 * method["max_events"])  # which is meant for one period
@@ -47,11 +52,24 @@ def base_point(
     # Of equally near returns the one nearest to the guess: a user who asks for two laps gets two.
     best = share[jnp.argmin(gap + 0.05 * jnp.abs(share - 1))]
     reached = is_okay(sol.result)
-    return here, jnp.where(reached, best, 1) * period
+    return here, jnp.where(reached, best, 1) * period, of_relays(system, modes[longest])
 
 
-def at_start(model: Model, t: Scalar, y: Y) -> Any:
-    """The mode by the signs of h; a surface counts as slid upon."""
+def of_relays(system: System, mode: Any) -> Relays:
+    """Of a mode of all switches that of the relays, as an argument for `solve`."""
+    return {k.name: mode[i] for i, k in enumerate(system.switches) if isinstance(k, relay)} or None
+
+
+@eqx.filter_jit
+def undecided(system: System, t0: Scalar, y0: Y) -> dict[str, Bool[Array, ""]]:
+    """Which relays are within their hysteresis."""
+    relays = [k for k in system.switches if isinstance(k, relay)]
+    return {k.name: (k.guard(system, t0, y0) <= 0) & (k.off_guard(system, t0, y0) <= 0) for k in relays}
+
+
+def at_start(model: Model, t: Scalar, y: Y, given: Relays = None) -> Any:
+    """The mode by the signs of h, and of relays within their hysteresis that which is given; a surface counts as slid
+    upon."""
     modes = []
     for k, switch in enumerate(model.switches):
         zero = jnp.zeros((), jnp.int32)
@@ -60,7 +78,9 @@ def at_start(model: Model, t: Scalar, y: Y) -> Any:
             noise = jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y))
             zero = jnp.where(jnp.abs(h) <= 1e3 * noise, 0, jnp.sign(h)).astype(jnp.int32)
         elif isinstance(switch, relay):
-            zero = (switch.guard(model.system, t, y) > 0).astype(jnp.int32)
+            on, off = (h(model.system, t, y) > 0 for h in (switch.guard, switch.off_guard))
+            zero = jnp.asarray((given or {}).get(switch.name, zero), jnp.int32)
+            zero = jnp.where(on, 1, jnp.where(off, 0, zero))
         elif isinstance(switch, clock):
             zero = model.counts(t)[k]
         modes.append(zero)
@@ -70,15 +90,16 @@ def at_start(model: Model, t: Scalar, y: Y) -> Any:
 @eqx.filter_jit
 def settle_down(
     system: System, t0: Scalar, y0: Y, sign: float, mode: Any, method: dict
-) -> tuple[Y, Scalar, Bool[Array, ""]]:
+) -> tuple[Y, Scalar, Bool[Array, ""], Relays]:
     """Follows the solution (backwards if `sign` is -1) to where it settles; for an autonomous system also the time in
-    which it returns there (0 if it does not), and whether it comes to rest.
+    which it returns there (0 if it does not), and whether it comes to rest; and the modes of relays there.
 
     How long that takes is measured in steps of the integration, which know the system's own scale of time.
     """
     if system.period is not None:
-        last, _ = _laps(system, t0, y0, sign, mode, method, 100)
-        return last, jnp.asarray(system.period, t0.dtype), jnp.zeros((), bool)
+        last, at_last, _ = _laps(system, t0, y0, sign, mode, method, 100)
+        period = jnp.asarray(system.period, t0.dtype)
+        return last, period, jnp.zeros((), bool), of_relays(system, at_last)
     # Only a guess is wanted: a loose tolerance makes long steps, and so the solution is followed farther.
     loose = 1e-6 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4
     controller = dfx.PIDController(rtol=loose, atol=loose)
@@ -100,14 +121,40 @@ def settle_down(
     far = jnp.cumsum(gap > 0.3) > 0
     near = far & (gap < 0.1)
     low = near & (gap <= jnp.roll(gap, 1)) & (gap <= jnp.roll(gap, -1))
-    rests = (last.result == RESULTS.max_steps_reached) & (jnp.max(scale) <= 1e-4 * (1 + jnp.max(jnp.abs(here))))
-    return last.y1, jnp.where(rests, 0, sign * (times[jnp.argmax(low)] - t0)), rests
+    ended = (last.result == RESULTS.max_steps_reached) | (last.result == RESULTS.successful)
+    rests = ended & (jnp.max(scale) <= 1e-4 * (1 + jnp.max(jnp.abs(here))))
+    period = jnp.where(rests, 0, sign * (times[jnp.argmax(low)] - t0))
+    return last.y1, period, rests, of_relays(system, last.mode1)
+
+
+@eqx.filter_jit
+def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
+    """Whether an equilibrium of the sliding field is one of a continuum: on the surfaces that hold it the derivative of
+    the field is singular."""
+    model = Model(system, jnp.ones_like(t0), t0, y)
+    state = at_start(model, t0, y)
+    x, unravel = jfu.ravel_pytree(y)
+    matrix = jax.jacfwd(lambda x: ravel(model.flow(t0, unravel(x), state)))(x)
+    size = jnp.max(jnp.abs(matrix))
+    sticks = jnp.zeros((), bool)
+    for k, switch in enumerate(model.switches):
+        if isinstance(switch, sgn):
+            held = state.mode[k] == 0
+            sticks = sticks | held
+            for i in range(model.parts[k]):
+                # Off the surface, where nothing is asked, it is made regular.
+                n = jax.grad(lambda x, k=k, i=i: model.h(k, t0, unravel(x))[i])(x)
+                n = n / jnp.where(jnp.any(n != 0), jnp.linalg.norm(n), 1)
+                matrix = matrix + jnp.where(held, size, 0) * jnp.outer(n, n)
+    values = jnp.linalg.svd(matrix, compute_uv=False)
+    return sticks & (values[-1] <= 1e-9 * values[0])
 
 
 def _laps(
     system: System, t0: Scalar, y0: Y, sign: float, mode: Any, method: dict, number: int
-) -> tuple[Y, Float[Array, "laps n"]]:
-    """A solution of a forced system after so many periods, and its states after each: `method` is meant for one."""
+) -> tuple[Y, tuple, Float[Array, "laps n"]]:
+    """A solution of a forced system after so many periods, its mode, and its states after each: `method` is meant for
+    one."""
     end = t0 + sign * jnp.asarray(system.period, t0.dtype)
 
     def lap(here: tuple, _: Any) -> tuple[tuple, Array]:
@@ -116,14 +163,14 @@ def _laps(
         return (sol.y1, tuple(sol.mode1)), ravel(sol.y1)
 
     first = solve(system, t0, end, y0, mode=mode, throw=False, **method)
-    (last, _), later = lax.scan(lap, (first.y1, tuple(first.mode1)), None, length=number - 1)
-    return last, jnp.concatenate([ravel(first.y1)[None], later])
+    (last, at_last), later = lax.scan(lap, (first.y1, tuple(first.mode1)), None, length=number - 1)
+    return last, at_last, jnp.concatenate([ravel(first.y1)[None], later])
 
 
 @eqx.filter_jit
-def repeats(system: System, t0: Scalar, y0: Y, sign: float, method: dict, most: int = 16) -> Int[Array, ""]:
+def repeats(system: System, t0: Scalar, y0: Y, sign: float, mode: Any, method: dict, most: int = 16) -> Int[Array, ""]:
     """After how many periods of the forcing a solution that has settled repeats itself."""
-    _, points = _laps(system, t0, y0, sign, None, method, most)
+    _, _, points = _laps(system, t0, y0, sign, mode, method, most)
     gaps = distance(points, ravel(y0))
     # What is left of the way to where it settles is small beside the state, and beside how far the points lie apart.
     extent = 1e-4 * jnp.max(jnp.abs(points)) + 1e-2 * jnp.max(gaps)

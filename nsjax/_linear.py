@@ -24,7 +24,8 @@ def linear_solve(a: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, 
     """
     m = len(b)
     if m > 3:
-        return jnp.linalg.solve(a, b)
+        rows, columns = _scales(lax.stop_gradient(a))
+        return columns * jnp.linalg.solve(rows[:, None] * a * columns, rows * b)
     columns = [[a[i, j] for i in range(m)] for j in range(m)]
     right = [b[i] for i in range(m)]
     whole = _determinant(columns)
@@ -43,6 +44,23 @@ def parallel(a: Float[Array, " m"], b: Float[Array, " m"]) -> Bool[Array, ""]:
 def nearly(like: Array) -> float:
     """How closely two numbers must agree to count as equal, of those that are computed from several others."""
     return max(1e-10, 64 * float(jnp.finfo(like.dtype).eps))
+
+
+def _scales(a: Float[Array, "m m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Powers of two for rows and columns, with which entries that are not zero are of size one on (geometric) average.
+
+    Elimination chooses its pivots among the entries of a column, and so by the units of the rows: with units 24 orders
+    of magnitude apart the error is up to 200 eps cond, and 6 eps cond with these scales (170 with those of the largest
+    entries).
+    """
+    there = (a != 0).astype(a.dtype)
+    size = there * jnp.log2(jnp.where(a == 0, 1, jnp.abs(a)))
+    by_row, by_column = (jnp.maximum(jnp.sum(there, axis), 1) for axis in (1, 0))
+    rows, columns = jnp.zeros_like(a[0]), jnp.zeros_like(a[0])
+    for _ in range(4):
+        rows = -jnp.sum(size + there * columns, 1) / by_row
+        columns = -jnp.sum(size + there * rows[:, None], 0) / by_column
+    return jnp.exp2(jnp.round(rows)), jnp.exp2(jnp.round(columns))
 
 
 def _determinant(columns: list[list[Array]]) -> Scalar:

@@ -94,10 +94,13 @@ class OrbitCurve(eqx.Module):
         parts = tuple(p if on else None for p, on in zip(part, several))
         return State(tuple(mode), parts, tuple(jnp.zeros((), jnp.int32) for _ in model.switches))
 
-    def guards(self, model: Model, t: Scalar, x: Array, state: State) -> Float[Array, "slots parts"]:
+    def guard_rows(self, model: Model, t: Scalar, x: Array, state: State) -> list[list[Scalar]]:
+        """`[slot][part]`; those that no segment asks for are 1."""
         wanted = tuple(self.slides or not slot.holding for slot in model.slots)
-        rows = model.guards(t, self.unravel(x), state, wanted)
-        return model.stacked([row or [jnp.ones_like(t)] for row in rows], -jnp.inf)
+        return [row or [jnp.ones_like(t)] for row in model.guards(t, self.unravel(x), state, wanted)]
+
+    def guards(self, model: Model, t: Scalar, x: Array, state: State) -> Float[Array, "slots parts"]:
+        return model.stacked(self.guard_rows(model, t, x, state), -jnp.inf)
 
     def guard(self, model: Model, t: Scalar, x: Array, state: State, slot: Array, entry: Array) -> Scalar:
         if not model.slots:

@@ -28,8 +28,7 @@ class Row(NamedTuple):
     period: Scalar
     t: Scalar
     x: Array
-    low: Array
-    high: Array
+    u: Array
     multipliers: Array
     stable: Bool[Array, ""]
 
@@ -71,7 +70,7 @@ def lane_tests(rows: int, slots: int) -> list[Test]:
 
 def values_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Array:
     share = look.u[-1]
-    corners, there = corner_values(curve, look, course, look.between)
+    corners, there = corner_values(curve, look, course)
     smooth = jnp.stack([look.tangent[-1], branch_value(look, log)])
     circle = circle_values(look.multipliers, curve.autonomous)
     ends = jnp.stack([share, 1 - share])
@@ -87,7 +86,7 @@ def place_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Plac
     i = jnp.argmax(length * jnp.where(held, 1e-6, 1.0))
     middle = look.ts.shape[1] // 2
     row = Row(
-        look.parameter, look.period, look.ts[i, middle], look.xs[i, middle], look.low, look.high, look.multipliers,
+        look.parameter, look.period, look.ts[i, middle], look.xs[i, middle], look.u, look.multipliers,
         look.stable,
     )  # fmt: skip
     return Place(look.u, look.tangent, look.branch[1], values_of(curve, look, course, log), row)
@@ -99,7 +98,9 @@ def follow_lane(
     """The branch from `u` on, to its end, to the first corner, or to so many points."""
     zero, none = jnp.zeros_like(u[0]), jnp.zeros((), jnp.int32)
     border = jnp.zeros_like(u).at[-1].set(1)
-    blank = jax.eval_shape(lambda: place_of(curve, step_on(curve, course, u, border, zero, u), course, zero))
+    blank = jax.eval_shape(
+        lambda: place_of(curve, step_on(curve, course, u, border, zero, u, turns=False), course, zero)
+    )
     at = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)._replace(u=u, tangent=border)
     rows = jax.tree.map(lambda x: jnp.zeros((points, *x.shape), x.dtype), blank.row)
     tests = lane_tests(len(course.slot), len(curve.model.slots))
@@ -140,7 +141,7 @@ def _moved(curve: OrbitCurve, course: Course, lane: Lane, ends: Array, upwards: 
     at, locating, starting = lane.at, lane.doing == LOCATING, lane.doing == STARTING
     chord = (lane.far.u - at.u) / jnp.where(locating, lane.length, 1)
     s = jnp.where(locating, _between(lane), lane.length)
-    look = step_on(curve, course, at.u, at.tangent, s, at.u + s * jnp.where(locating, chord, at.tangent))
+    look = step_on(curve, course, at.u, at.tangent, s, at.u + s * jnp.where(locating, chord, at.tangent), turns=False)
     turn = jnp.where(starting & (look.tangent[-1] * upwards < 0), -1, 1).astype(s.dtype)
     # The sign of a determinant of which the tangent is a row.
     look = look._replace(tangent=turn * look.tangent, branch=look.branch * jnp.stack([turn, jnp.ones_like(turn)]))

@@ -7,14 +7,15 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool
 
 from ._course import Course, EVENT, FREE, TIME
 from ._filippov import Model
 from ._floquet import floquet, structural_zeros
 from ._implicit import find_root
+from ._minima import grouped, in_order, Minima, minima, places_of, RESOLVED
 from ._orbit_curve import OrbitCurve, row_sizes
-from ._segment_flow import NODES, THETA, with_parameter
+from ._segment_flow import with_parameter
 from ._system import relay
 from ._types import Scalar
 
@@ -33,13 +34,12 @@ class Look(NamedTuple):
     - `rates`: of the guard that ends each segment, there: negative unless it comes to its surface tangentially.
     - `ends`: value of that guard there.
     - `margins`: |λ| - b at events that cross a surface which could hold.
-    - `least`, `where`, `most`, `spots`: of each segment and guard the least value at the nodes, without the zeros that
-        it has at the ends; at which share of the segment; the largest value; and the state where it is least.
-    - `between`: the least value by parabolas between nodes. `rise`: by how much it is larger at a node beside that
-        one; `orders`: of its zeros at both ends.
+    - `least`, `where`, `most`, `spots`: of each segment and guard the least value, without the zeros that it has at the
+        ends; at which share of the segment; how large it is elsewhere; and the state where it is least.
     - `low`, `high`: the least and the largest value of each component of the state; `mean`, `square`: its mean and that
         of its square over time.
-    - `ts`, `xs`: times and states along each segment.
+    - `ts`, `xs`: times and states along each segment; `turns_t`, `turns_x`: where in each segment each component of the
+        state is least, and where it is largest.
     - `branch`: sign and logarithm of the determinant of the equations bordered by the tangent.
     - `residual`: the largest of the equations.
     """
@@ -64,15 +64,14 @@ class Look(NamedTuple):
     where: Array
     most: Array
     spots: Array
-    between: Array
-    rise: Array
-    orders: Array
     low: Array
     high: Array
     mean: Array
     square: Array
     ts: Array
     xs: Array
+    turns_t: Array
+    turns_x: Array
     branch: Array
     residual: Scalar
 
@@ -95,19 +94,22 @@ def _advance(
 
 
 def step_on(
-    curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array, newton: Array | bool = True
-) -> Look:
-    """`advance`, within a program."""
+    curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array,
+    newton: Array | bool = True, turns: bool = True,
+) -> Look:  # fmt: skip
+    """`advance`, within a program; without `turns` the largest and least states are those at the nodes."""
 
     def residual(u: Array, _: Any) -> Array:
         off = jnp.append(curve.residual(u, course, origin)[0], border @ (u - origin) - s)
         return jnp.where(newton, off, u - guess)
 
     u, good = find_root(residual, guess, None, TOLERANCE, 10)
-    return look_at(curve, u, border, course, origin, good)
+    return look_at(curve, u, border, course, origin, good, turns)
 
 
-def look_at(curve: OrbitCurve, u: Array, border: Array, course: Course, origin: Array, good: Array) -> Look:
+def look_at(
+    curve: OrbitCurve, u: Array, border: Array, course: Course, origin: Array, good: Array, turns: bool
+) -> Look:
     begin, end, x, value = curve.parts(u)
     n, rows, m = len(curve.sizes), len(begin), curve.dimension
     model = with_parameter(curve.model, curve.path, value)
@@ -167,29 +169,24 @@ def look_at(curve: OrbitCurve, u: Array, border: Array, course: Course, origin: 
     monodromy, multipliers, stable = (jnp.where(free, x, y) for x, y in either)
 
     # Along the way.
-    theta = jnp.asarray(THETA, u.dtype)
-
-    def path(a: Scalar, b: Scalar, x: Array, mode: Array, part: Array) -> tuple[Array, Array, Array]:
-        return curve.flow.along(a, b, x, value, curve.state(mode, part))
-
-    ts, xs, sums = jax.vmap(path)(begin, end, x, mode, part)
     inside = (index < course.num)[:, None]
-    low, high = -_largest(theta, -xs, inside), _largest(theta, xs, inside)
+    along = _along(curve, model, value, begin, end, x, course, turns)
+    least = along.least[:, 2 * n :]
+    low, high = jnp.min(jnp.where(inside, along.least[:, : 2 * n], jnp.inf), axis=0).reshape(2, n)
     length = jnp.sum(jnp.where(inside[:, 0], end - begin, 0))
-    mean, square = jnp.sum(jnp.where(inside[..., None], sums, 0), axis=0) / length
+    mean, square = jnp.sum(jnp.where(inside[..., None], along.sums, 0), axis=0) / length
     period = end[course.num - 1] - begin[0]
     if not curve.autonomous:
         period = jnp.asarray(model.system.period, u.dtype) * curve.order.astype(u.dtype)
-    least, between, most, index, rise, orders = _least(curve, model, theta, ts, xs, course)
-    where, spots = theta[index], jnp.take_along_axis(xs, index[..., None], axis=1)
+    turns_t = begin[:, None] + (end - begin)[:, None] * along.share[:, : 2 * n]
     rates, values, margins = _at_ends(curve, model, end, last, course)
     # Beside a branch point rounding moves the root by more than Newton's method is to find it to.
     wrong = jnp.max(jnp.abs(f))
     good = (good | (wrong < TOLERANCE)) & jnp.all(jnp.isfinite(tangent))
     return Look(
         u, tangent, good, value, period, begin, end, x, last, factors, monodromy, multipliers, stable,
-        rates, values, margins, least, where, most, spots, between, rise, orders, low, high, mean, square, ts, xs,
-        branch, wrong,
+        rates, values, margins, least, along.share[:, 2 * n :], along.most[:, 2 * n :], along.x[:, 2 * n :], low, -high,
+        mean, square, along.ts, along.xs, turns_t, along.x[:, : 2 * n], branch, wrong,
     )  # fmt: skip
 
 
@@ -199,37 +196,70 @@ def _infinitely_unstable(n: int, autonomous: bool) -> tuple[Array, Array, Array]
     return jnp.full((n, n), jnp.inf), jnp.array([jnp.inf, *rest], complex), jnp.array(False)
 
 
-def _least(
-    curve: OrbitCurve, model: Model, theta: Array, ts: Array, xs: Array, course: Course
-) -> tuple[Array, Array, Array, Int[Array, "rows slots"], Array, Array]:
-    """Of every guard in every segment the least value at the nodes, divided by the zeros that it must have at the
-    ends, and that between them; the largest; at which node it is least; by how much it rises to the nodes beside
-    that; and the zeros' orders."""
-    rows = len(ts)
-    if not model.slots:
-        none = jnp.ones((rows, 0), ts.dtype)
-        return none, none, none, jnp.zeros((rows, 0), jnp.int32), none, jnp.ones((2, rows, 0), ts.dtype)
-    mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
+@eqx.filter_jit
+def extremes(curve: OrbitCurve, course: Course, u: Array) -> tuple[Array, Array]:
+    """The least and the largest value of each component of the state along an orbit."""
+    begin, end, x, value = curve.parts(u)
+    model = with_parameter(curve.model, curve.path, value)
+    found = _along(curve, model, value, begin, end, x, course, turns=True, guards=False).least
+    inside = jnp.arange(len(begin), dtype=course.num.dtype) < course.num
+    low, high = jnp.min(jnp.where(inside[:, None], found, jnp.inf), axis=0).reshape(2, -1)
+    return low, -high
 
-    def row(ts: Array, xs: Array, m: Array, p: Array) -> Array:
-        state = curve.state(m, p)
-        return jax.vmap(lambda t, x: jnp.max(curve.guards(model, t, x, state), axis=-1))(ts, xs)
 
-    values = jax.vmap(row)(ts, xs, mode, part)  # rows, nodes, slots
-    zeros = jnp.asarray(zeros_at_begin(curve, model, course), values.dtype)  # rows, slots
-    here = jnp.arange(values.shape[-1], dtype=course.slot.dtype) == course.slot[:, None]
-    index = jnp.arange(rows, dtype=course.num.dtype)
-    after = jnp.where(index >= course.num - 1, 0, index + 1)
-    # On what is left freely it comes tangentially.
-    last = jnp.where((course.ends == EVENT)[:, None] & here, jnp.where(course.ends[after] == FREE, 2, 1)[:, None], 0)
-    orders = jnp.stack([zeros, last.astype(theta.dtype)])
-    deflated = _deflated(values, theta[None, :, None], orders[:, :, None])
-    index = jnp.argmin(deflated, axis=1)
-    least = jnp.min(deflated, axis=1)
-    beside = jnp.clip(jnp.stack([index - 1, index + 1], axis=1), 0, len(theta) - 1)
-    rise = jnp.max(jnp.take_along_axis(deflated, beside, axis=1), axis=1) - least
-    between = jnp.minimum(least, _dip(theta, deflated))
-    return least, between, jnp.max(values, axis=1), index, rise, orders
+def _along(
+    curve: OrbitCurve, model: Model, value: Array, begin: Array, end: Array, x: Array, course: Course, turns: bool,
+    guards: bool = True,
+) -> Minima:  # fmt: skip
+    """Of every segment the least values of the state's components, of their negatives (with `turns` between nodes too),
+    and of the guards, these divided by the zeros that they must have at the ends."""
+    rows, slots = len(begin), len(model.slots) * guards
+    orders = jnp.zeros((rows, 2, 0), x.dtype)
+    if slots:
+        zeros = jnp.asarray(zeros_at_begin(curve, model, course), x.dtype)  # rows, slots
+        here = jnp.arange(slots, dtype=course.slot.dtype) == course.slot[:, None]
+        index = jnp.arange(rows, dtype=course.num.dtype)
+        after = jnp.where(index >= course.num - 1, 0, index + 1)
+        # On what is left freely it comes tangentially.
+        order = jnp.where(course.ends[after] == FREE, 2, 1)[:, None]
+        last = jnp.where((course.ends == EVENT)[:, None] & here, order, 0)
+        orders = jnp.stack([zeros, last.astype(x.dtype)], axis=1)
+    plain = jnp.zeros((rows, 2, 2 * len(curve.sizes)), x.dtype)
+    orders = jnp.concatenate([plain, orders], axis=2)
+    return jax.vmap(lambda *segment: along_segment(curve, model, value, *segment, turns=turns))(
+        begin, end, x, jnp.asarray(course.mode), jnp.asarray(course.part), orders
+    )
+
+
+def along_segment(
+    curve: OrbitCurve, model: Model, value: Array, a: Scalar, b: Scalar, x: Array, mode: Array, part: Array,
+    orders: Array, turns: bool = True,
+) -> Minima:  # fmt: skip
+    """As `_along`, of one segment, with any orders of the zeros."""
+    n, state = len(curve.sizes), curve.state(mode, part)
+    slots = orders.shape[1] - 2 * n
+    slack = jnp.concatenate(
+        [jnp.asarray(size, x.dtype) for size in (curve.sizes, curve.sizes, curve.guard_sizes[:slots])]
+    )
+
+    def sample(first: Scalar, last: Scalar, x: Array) -> tuple[Array, Array, Array]:
+        end = jnp.where(last < 1, a + (b - a) * last, b)
+        return curve.flow.along(a + (b - a) * first, end, x, value, state)
+
+    def rows(t: Scalar, x: Array) -> list[list[Array]]:
+        guards = curve.guard_rows(model, t, x, state) if slots else []
+        return [*([x[i]] for i in range(n)), *([-x[i]] for i in range(n)), *guards]
+
+    places = places_of(jax.eval_shape(rows, a, x))
+
+    def functions(ts: Array, xs: Array) -> tuple[list[Array], Array]:
+        return grouped(jax.vmap(rows)(ts, xs)), RESOLVED * slack[places]
+
+    def below(most: Array) -> Array:
+        # The least value of a guard is of interest where it is about to vanish.
+        return jnp.where(places < 2 * n, jnp.inf if turns else -jnp.inf, 0.1 * most)
+
+    return in_order(minima(sample, functions, x, orders[:, places], below), places)
 
 
 def zeros_at_begin(curve: OrbitCurve, model: Model, course: Course) -> Array:
@@ -289,59 +319,3 @@ def _at_ends(curve: OrbitCurve, model: Model, end: Array, last: Array, course: C
         return rate, curve.guard(model, t, x, state, slot, entry), margin
 
     return jax.vmap(row)(end, last, mode, part, following, course.slot, course.entry)
-
-
-def _dip(theta: Array, v: Float[Array, "rows nodes slots"]) -> Float[Array, "rows slots"]:
-    """The least value between nodes, by the parabola about every node."""
-    near, far = (theta[1:-1] - theta[:-2])[:, None], (theta[2:] - theta[1:-1])[:, None]
-    mid = v[:, 1:-1]
-    a, b = (mid - v[:, :-2]) / near, (v[:, 2:] - mid) / far
-    slope, bend = (a * far + b * near) / (near + far), (b - a) / (near + far)
-    low = mid - slope**2 / jnp.where(bend > 0, 4 * bend, jnp.inf)
-    inside = (bend > 0) & (-slope < 2 * bend * far) & (slope < 2 * bend * near)
-    return jnp.min(jnp.where(inside, low, jnp.inf), axis=1)
-
-
-def _deflated(values: Array, theta: Array, orders: Array) -> Array:
-    """Divided by zeros at both ends, of these orders."""
-    below = theta ** orders[0] * (1 - theta) ** orders[1]
-    # A node beside a zero is rounding divided by little.
-    return jnp.where(below > 1e-9, values / jnp.where(below > 0, below, 1), jnp.inf)
-
-
-def _largest(theta: Array, xs: Array, inside: Array) -> Array:
-    """The largest value of each component, by the parabola through the largest sample and its neighbours."""
-    here = jnp.where(inside[..., None], xs, -jnp.inf)
-    peak = jnp.clip(jnp.argmax(here, axis=1), 1, len(theta) - 2)  # rows, components
-    a, b, c = (jnp.take_along_axis(xs, (peak + k)[:, None], axis=1)[:, 0] for k in (-1, 0, 1))
-    ta, tb, tc = (theta[peak + k] for k in (-1, 0, 1))
-    left, right = (b - a) / (tb - ta), (c - b) / (tc - tb)
-    bend = (right - left) / (tc - ta)
-    safe = jnp.where(bend < 0, bend, -1)
-    at = jnp.clip((ta + tb) / 2 - left / (2 * safe), ta, tc)
-    top = a + left * (at - ta) + bend * (at - ta) * (at - tb)
-    best = jnp.maximum(jnp.max(here, axis=1), jnp.where(bend < 0, top, -jnp.inf))
-    return jnp.max(jnp.where(inside, best, -jnp.inf), axis=0)
-
-
-@eqx.filter_jit
-def least_between(
-    curve: OrbitCurve, value: Scalar, ab: Array, shares: Array, x: Array, mode: Array, part: Array, slot: Array,
-    orders: Array,
-) -> Scalar:  # fmt: skip
-    """The least value of a guard between two shares of a segment, from the state at the first one; without the zeros at
-    its ends. Where several components meet, at a tip, it has a kink there: each is interpolated for itself."""
-    model = with_parameter(curve.model, curve.path, value)
-    state = curve.state(mode, part)
-    theta = shares[0] + (shares[1] - shares[0]) * jnp.asarray(THETA, x.dtype)
-    begin, end = ab[0] + (ab[1] - ab[0]) * shares
-    ts, xs, _ = curve.flow.along(begin, end, x, value, state)
-    parts = jax.vmap(lambda t, x: curve.guards(model, t, x, state)[slot])(ts, xs)
-    i = jnp.argmin(_deflated(jnp.max(parts, axis=1), theta, orders))
-    window = jnp.clip(i - 2, 0, NODES - 4) + jnp.arange(5, dtype=i.dtype)
-    nodes, five = theta[window], jnp.where(jnp.isneginf(parts[window]), -1e300, parts[window])  # which is no component
-    fine = jnp.linspace(theta[jnp.maximum(i - 1, 0)], theta[jnp.minimum(i + 1, NODES)], NODES + 1)
-    apart = ~jnp.eye(5, dtype=bool)
-    shares_of = (fine[:, None, None] - nodes) / jnp.where(apart, nodes[:, None] - nodes, 1)
-    weights = jnp.prod(jnp.where(apart, shares_of, 1), axis=-1)  # of Lagrange's polynomials
-    return jnp.min(_deflated(jnp.max(weights @ five, axis=1), fine, orders))

@@ -38,7 +38,12 @@ class Recorder:
         if not self.measures:
             return {}
         n, look = int(spot.course.num), spot.look
-        ts, ys = look.ts[:n].ravel(), states_of(curve.like, look.xs[:n].reshape(-1, look.xs.shape[-1]))
+        # Where components of the state are largest and least is no sample's affair.
+        ts = np.concatenate([look.ts[:n], look.turns_t[:n]], axis=1)
+        xs = np.concatenate([look.xs[:n], look.turns_x[:n]], axis=1)
+        order = np.argsort(ts, axis=1, kind="stable")
+        ts, xs = np.take_along_axis(ts, order, 1).ravel(), np.take_along_axis(xs, order[..., None], 1)
+        ys = states_of(curve.like, xs.reshape(-1, xs.shape[-1]))
         return {name: self.measured(name, ts, ys, spot.parameter) for name in self.measures}
 
     def measured(self, name: str, ts: np.ndarray, ys: Y, parameter: float) -> np.ndarray:

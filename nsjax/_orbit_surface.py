@@ -15,10 +15,10 @@ from ._course import capacity_for, Course, EVENT, LEAST, Start
 from ._floquet import trivial
 from ._orbit_bifurcation import Origin
 from ._orbit_curve import linearised, OrbitCurve
-from ._orbit_look import advance, Look, zeros_at_begin
+from ._orbit_look import advance, along_segment, Look, zeros_at_begin
 from ._orbit_trace import of_circle, of_corners, Spot, spot_of
 from ._parameter import get_parameter
-from ._segment_flow import THETA, with_parameter
+from ._segment_flow import with_parameter
 from ._test_function import branch_value, CIRCLE, CORNERS, Test
 
 
@@ -220,23 +220,27 @@ def cleared(curve: OrbitCurve, spot: Spot) -> Spot:
         slot = int(course.slot[cut])
         for row in {cut, (cut + 1) % n}:
             before = row - 1 if row else n - 1
-            begins = 2 if (course.ends[before], course.slot[before]) == (LEAST, slot) else zeros[row, slot]
-            ends = {LEAST: 2, EVENT: 1}.get(int(course.ends[row]), 0) if course.slot[row] == slot else 0
-            below = THETA**begins * (1 - THETA) ** ends
-            values = np.asarray(_guards_along(curve, look, course, np.asarray(row)))[:, slot]
-            # Samples nearer to the double zero are rounding divided by little.
-            values = np.where(below > 1e-4, values / np.maximum(below, 1e-4), np.inf)
-            at = int(np.argmin(values))
-            least[row, slot], where[row, slot], spots[row, slot] = values[at], THETA[at], look.xs[row][at]
+            orders = np.zeros((2, least.shape[1]))
+            orders[0, slot] = 2 if (course.ends[before], course.slot[before]) == (LEAST, slot) else zeros[row, slot]
+            ends = {LEAST: 2, EVENT: 1}
+            orders[1, slot] = ends.get(int(course.ends[row]), 0) if course.slot[row] == slot else 0
+            found = jax.device_get(_guards_along(curve, look, course, np.asarray(row), orders))
+            least[row, slot], where[row, slot], spots[row, slot] = (part[slot] for part in found)
     return dataclasses.replace(spot, look=look._replace(least=least, where=where, spots=spots))
 
 
 @eqx.filter_jit
-def _guards_along(curve: OrbitCurve, look: Look, course: Course, row: Array) -> Array:
-    """The values of the guards at the samples of a segment."""
-    model = with_parameter(curve.model, curve.path, look.parameter)
-    state = curve.state(jnp.asarray(course.mode)[row], jnp.asarray(course.part)[row])
-    return jax.vmap(lambda t, x: jnp.max(curve.guards(model, t, x, state), axis=-1))(look.ts[row], look.xs[row])
+def _guards_along(
+    curve: OrbitCurve, look: Look, course: Course, row: Array, orders: Array
+) -> tuple[Array, Array, Array]:
+    """The least values of the guards along a segment, divided by zeros of these orders at its ends; where; and the
+    states there."""
+    model, n = with_parameter(curve.model, curve.path, look.parameter), len(curve.sizes)
+    orders = jnp.concatenate([jnp.zeros((2, 2 * n), orders.dtype), orders], axis=1)
+    rows = look.begin, look.end, look.x, course.mode, course.part
+    a, b, x, mode, part = (jnp.asarray(column)[row] for column in rows)
+    found = along_segment(curve, model, look.parameter, a, b, x, mode, part, orders, turns=False)
+    return found.least[2 * n :], found.share[2 * n :], found.x[2 * n :]
 
 
 def interval_tests(spot: Spot) -> dict[Test, float]:

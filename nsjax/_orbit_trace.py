@@ -10,8 +10,7 @@ import numpy as np
 from ._bracket import bracketed
 from ._course import Course
 from ._orbit_curve import OrbitCurve, state_at
-from ._orbit_look import advance, least_between, Look
-from ._segment_flow import NODES, THETA
+from ._orbit_look import advance, Look
 from ._test_function import (
     BRANCH,
     branch_value,
@@ -51,25 +50,8 @@ class Spot:
 
 
 def spot_of(curve: OrbitCurve, look: Look, course: Course) -> Spot:
-    look = _exact(curve, jax.device_get(look), course)
+    look = jax.device_get(look)
     return Spot(look, course, look.multipliers, bool(look.stable), look.monodromy)
-
-
-def _exact(curve: OrbitCurve, look: Look, course: Course) -> Look:
-    """With the least values of guards where those at the nodes leave open whether they are positive."""
-    n = int(course.num)
-    open_ones = (look.least[:n] < look.rise[:n]) & np.isfinite(look.rise[:n])
-    least = np.array(look.least)
-    for i, j in np.argwhere(open_ones):
-        node = int(np.argmin(np.abs(THETA - look.where[i, j])))
-        begin, end = look.begin[i], look.end[i]
-        if not 0 < node < NODES or not end > begin:
-            continue
-        ab, shares = np.array([begin, end]), THETA[[node - 1, node + 1]]
-        args = (look.xs[i, node - 1], course.mode[i], course.part[i], np.asarray(j), look.orders[:, i, j])
-        value = float(least_between(curve, look.parameter, ab, shares, *args))
-        least[i, j] = min(least[i, j], value) if np.isfinite(value) else least[i, j]
-    return look._replace(least=least)
 
 
 def midpoint(curve: OrbitCurve, spot: Spot, rows: Iterable[int]) -> tuple[float, np.ndarray, np.ndarray]:
@@ -96,8 +78,7 @@ def told_by(curve: OrbitCurve, spot: Spot, log: float) -> dict[Test, float]:
 
 
 def of_corners(curve: OrbitCurve, spot: Spot) -> dict[Test, float]:
-    """With the exact least values of guards."""
-    values, there = corner_values(curve, spot.look, spot.course, spot.look.least)
+    values, there = corner_values(curve, spot.look, spot.course)
     names = corner_tests(*spot.look.least.shape)
     return {names[i]: float(values[i]) for i in np.flatnonzero(there)}
 

@@ -293,7 +293,12 @@ class Pencil:
 
         def on(q: float) -> int:
             s = self.at(q)
-            return int(np.sum(np.abs(s.side) <= s.doubt))
+            # One as near to a defective eigenvalue as the root of rounding, which parts that, belongs to it: the roots
+            # of sums with it are as far from the crossing.
+            cloud = np.minimum(s.doubt, np.sqrt(DOUBT) * np.linalg.norm(np.abs(self.a) + np.abs(self.b)))
+            near = np.abs(s.values[:, None] - s.values) <= cloud
+            doubt = np.maximum(s.doubt, np.max(np.where(near, cloud, 0), axis=1))
+            return int(np.sum(np.abs(s.side) <= doubt))
 
         return on((p + q) / 2) > (max(on(p - NEARLY_REAL), on(q + NEARLY_REAL)) if self.stays else 0)
 

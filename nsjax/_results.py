@@ -105,6 +105,11 @@ with warnings.catch_warnings():  # of another text for success, which diffrax pr
         orbit_is_equilibrium = (
             "The search for a periodic orbit ended in an equilibrium. Start farther away from it, near the orbit."
         )
+        orbit_sticks_for_ever = (
+            "Friction holds the solution for ever, and not at one place only: every state of a continuum repeats "
+            "itself, and no orbit is isolated. Start where friction slips, with more energy, or make friction smaller, "
+            "or larger what drives the system."
+        )
         orbit_is_multiple_cover = (
             "The orbit found repeats itself within the period asked for. Divide `period` (or `order`) by the number"
             " of repetitions."

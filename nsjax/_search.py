@@ -1,6 +1,7 @@
 """The ways in which a periodic orbit is searched for, one after the other."""
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,12 +9,12 @@ import jax.lax as lax
 import jax.numpy as jnp
 
 from ._cuts import cuts_from, cuts_near, Segment
-from ._guess import repeats, settle_down
+from ._guess import of_relays, repeats, settle_down, sticks_anywhere, undecided
 from ._orbit import Orbit
 from ._results import is_okay, RESULTS
 from ._segments import by_segments
 from ._shooting import shoot
-from ._system import frozen, System
+from ._system import frozen, sgn, System
 from ._types import Scalar, Y
 
 
@@ -40,39 +41,64 @@ class Search(NamedTuple):
         return -1.0 if self.backward else 1.0
 
     def run(self, system: System, y0: Y, period: Any) -> Orbit:
-        """The orbit that is found from what is known."""
+        """The orbit that is found from what is known; one of a continuum is named as such."""
+        orbit = self._found(system, y0, period)
+        if self.concrete and system.period is not None and orbit.result == RESULTS.successful:
+            sticks = RESULTS.where(_neutral(orbit), RESULTS.orbit_sticks_for_ever, orbit.result)
+            orbit = eqx.tree_at(lambda o: o.result, orbit, sticks)
+        return orbit
+
+    def _found(self, system: System, y0: Y, period: Any) -> Orbit:
         if self.segments is not None:
             cuts = cuts_from(frozen(system), self.segments, self.t0, lax.stop_gradient(y0), self.how)
             return by_segments(system, cuts, self.t0, self.order or 1, self.pieces, how=self.how, **self.newton)
         if system.period is None and period is None:
             return self._from_nothing(system, y0)
         if self.order is None and system.period is not None:
-            start, _, _ = self._settled(system, y0)
-            order = int(repeats(system, self.t0, start, self.sign, self.how))
-            return self._tries(system, start, jnp.ones_like(self.t0), order, None)
+            start, _, _, mode = self._settled(system, y0)
+            order = int(repeats(system, self.t0, start, self.sign, mode, self.how))
+            return self._tries(system, start, jnp.ones_like(self.t0), order, mode)
         period = jnp.asarray(1.0 if period is None else period, self.t0.dtype)
         if self.concrete and not period > 0:
             raise ValueError(f"Argument `period` must be positive, but got {period}.")
         order = self.order or 1
+        for mode in self._modes(system, y0):
+            orbit = self._once(system, y0, period, order, mode, None)
+            if bool(is_okay(orbit.result)):
+                return orbit
         orbit = self._tries(system, y0, period, order, self.mode)
         if self.concrete and not bool(is_okay(orbit.result) | (orbit.result == RESULTS.orbit_is_multiple_cover)):
-            start, period, rests = self._settled(system, y0)
+            start, period, rests, mode = self._settled(system, y0)
             if rests:
-                orbit = eqx.tree_at(lambda o: o.result, orbit, RESULTS.orbit_is_equilibrium)
+                orbit = eqx.tree_at(lambda o: o.result, orbit, self._at_rest(system, start))
             if period > 0:
-                second = self._tries(system, start, period, order, None)
+                second = self._tries(system, start, period, order, mode)
                 orbit = second if bool(is_okay(second.result)) else orbit
         return orbit
 
-    def _settled(self, system: System, y0: Y) -> tuple[Y, Scalar, Any]:
+    def _modes(self, system: System, y0: Y) -> Iterator[dict[str, Any]]:
+        """Where nothing is told of relays that are within their hysteresis, all modes in which they may be."""
+        if not self.concrete or self.method == "segments" or self.pieces != 1 or not of_relays(system, system.switches):
+            return
+        given = self.mode or {}
+        names = [k for k, open_ in undecided(system, self.t0, y0).items() if open_ and k not in given]
+        for values in itertools.product((0, 1), repeat=len(names)) if names else ():
+            yield given | {name: jnp.asarray(value, jnp.int32) for name, value in zip(names, values)}
+
+    def _at_rest(self, system: System, y: Y) -> RESULTS:
+        sticks = sticks_anywhere(frozen(system), self.t0, y)
+        return RESULTS.where(sticks, RESULTS.orbit_sticks_for_ever, RESULTS.orbit_is_equilibrium)
+
+    def _settled(self, system: System, y0: Y) -> tuple[Y, Scalar, Any, Any]:
         return settle_down(frozen(system), self.t0, lax.stop_gradient(y0), self.sign, self.mode, self.how)
 
     def _from_nothing(self, system: System, y0: Y) -> Orbit:
         """Of an autonomous system, without a guess of the period."""
-        start, period, rests = self._settled(system, y0)
+        start, period, rests, mode = self._settled(system, y0)
         lost = ~(period > 0)
-        orbit = self._tries(system, start, jnp.where(lost, 1, period), 1, None)
-        end = RESULTS.where(rests, RESULTS.orbit_is_equilibrium, RESULTS.orbit_not_found)
+        orbit = self._tries(system, start, jnp.where(lost, 1, period), 1, mode)
+        at_rest = self._at_rest(system, start) if self.concrete else RESULTS.orbit_is_equilibrium
+        end = RESULTS.where(rests, at_rest, RESULTS.orbit_not_found)
         return eqx.tree_at(lambda o: o.result, orbit, RESULTS.where(lost, end, orbit.result))
 
     def _tries(self, system: System, y0: Y, period: Scalar, order: int, mode: Any) -> Orbit:
@@ -97,3 +123,10 @@ class Search(NamedTuple):
         orbit = by_segments(system, cuts, t0, order, pieces, how=how, **self.newton)
         result = RESULTS.where(closes, orbit.result, RESULTS.orbit_not_found)
         return eqx.tree_at(lambda o: o.result, orbit, result)
+
+
+def _neutral(orbit: Orbit) -> bool:
+    """Whether friction holds a forced orbit for all of its period, and lets others beside it repeat themselves too."""
+    switches, modes = orbit.system.switches, orbit.arcs.mode[: int(orbit.events.num) + 1]
+    held = any(isinstance(k, sgn) and bool(jnp.all(modes[:, i] == 0)) for i, k in enumerate(switches))
+    return held and bool(jnp.any(jnp.abs(orbit.multipliers - 1) <= 1e-6))

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from ._arcs import Smooth
 from ._exponential import affine_parts, expm, generator
 from ._filippov import Model, State
+from ._minima import NODES, THETA, WEIGHTS
 from ._parameter import Path, put_parameter
 from ._results import is_okay
 from ._solve import solve
@@ -24,13 +25,7 @@ from ._system import System
 from ._types import Scalar, Y
 
 
-NODES = 64  # parts of a segment at whose ends it is looked at
 NEVER, FREE_MODES, ALWAYS = range(3)  # when a mode's flow is known by its exponential
-
-# Chebyshev's points, denser at both ends, and the weights of integrals over them (Clenshaw and Curtis).
-THETA = 0.5 - 0.5 * np.cos(np.pi * np.arange(NODES + 1) / NODES)
-_moments = [0.0 if k % 2 else 1 / (1 - k**2) for k in range(NODES + 1)]
-WEIGHTS = np.linalg.solve(np.polynomial.chebyshev.chebvander(2 * THETA - 1, NODES).T, _moments)
 
 
 def with_parameter(model: Model, path: Path, value: Array) -> Model:
@@ -149,8 +144,8 @@ def _exponential(
 
 
 def _samples(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> Float[Array, "nodes n"]:
-    """States at the nodes: from those at equal distances, with two derivatives, by Hermite's polynomials of degree
-    five, which miss a 46080th of the sixth power of the phase between two of them."""
+    """States at the nodes: from those at equal distances, with three derivatives, by Hermite's polynomials of degree
+    seven, which miss a 10321920th of the eighth power of the phase between two of them."""
     m, scale, good = flow.generator(a, b, x, value, state)
     n, step = len(x), expm(m / NODES)
     z = jnp.zeros((len(m), 1), x.dtype).at[n, 0].set(1)
@@ -160,20 +155,21 @@ def _samples(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, st
     z = jnp.concatenate([z, step @ z[:, :1]], axis=1)
     first = m @ z / NODES
     second = m @ first / NODES
+    third = m @ second / NODES
     # Where each node lies between which two samples.
     cell = np.minimum((THETA * NODES).astype(int), NODES - 1)
     weights = jnp.asarray(_hermite(THETA * NODES - cell), x.dtype)
-    rows = [part[:n, cell + k] for k in (0, 1) for part in (z, first, second)]
+    rows = [part[:n, cell + k] for k in (0, 1) for part in (z, first, second, third)]
     out = sum(w * row for w, row in zip(weights, rows))
     return jnp.where(good, x[:, None] + scale * out, jnp.nan).T
 
 
 def _hermite(s: np.ndarray) -> np.ndarray:
-    """The polynomials of degree five that belong to value and two derivatives at 0, and at 1."""
-    at_zero = np.eye(3, 6) * np.array([1, 1, 2])[:, None]
-    powers = np.arange(6)
-    at_one = np.stack([np.ones(6), powers, powers * (powers - 1)])
-    coefficients = np.linalg.inv(np.concatenate([at_zero, at_one]))
+    """The polynomials of degree seven that belong to value and three derivatives at 0, and at 1."""
+    powers = np.arange(8)
+    factors = np.cumprod([np.ones(8), powers, powers - 1, powers - 2], axis=0)
+    at_zero = np.eye(4, 8) * factors
+    coefficients = np.linalg.inv(np.concatenate([at_zero, factors]))
     return (s[:, None] ** powers @ coefficients).T
 
 

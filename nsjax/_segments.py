@@ -168,7 +168,7 @@ def by_segments(
     # Where a free segment begins it is tangential that it must be.
     meant = jnp.roll(jnp.asarray(cuts.free), -1)
     grazes = jnp.any(cycle.happened & ~meant & (events.transversality < jnp.cbrt(jnp.finfo(end.dtype).eps)))
-    violation, violation_t = _violation(still, cycle, *cycle.flows(still).paths(*here))
+    violation, violation_t = _violation(still, cycle, *here)
     admissible = (violation == 0) & jnp.all(end - begin >= -1e3 * tol * (1 + jnp.abs(period)))
     result = RESULTS.where((result == RESULTS.successful) & grazes, RESULTS.tangential_event, result)
     result = RESULTS.where(is_okay(result) & ~admissible, RESULTS.orbit_not_admissible, result)
@@ -250,24 +250,26 @@ def _floquet(system: System, cycle: _Cycle, events: Events, phi: Array) -> tuple
     return *forwards(floquet(factors[::-1], infinite, autonomous), infinite, autonomous), zeros
 
 
-def _violation(system: System, cycle: _Cycle, ts: Array, xs: Array) -> tuple[Scalar, Scalar]:
+def _violation(system: System, cycle: _Cycle, begin: Array, end: Array, x: Array) -> tuple[Scalar, Scalar]:
     """By how much the guards of the modes are violated, and when: beyond what the tolerance makes of them."""
-    model, cuts = model_of(system, cycle.t0, cycle.y0), cycle.cuts
+    model, cuts, flows = model_of(system, cycle.t0, cycle.y0), cycle.cuts, cycle.flows(system)
     if not model.slots:
-        return jnp.zeros_like(ts[0, 0]), ts[0, 0]
+        return jnp.zeros_like(begin[0]), begin[0]
+    starts = begin[:, None] + (end - begin)[:, None] * jnp.arange(cycle.pieces, dtype=end.dtype) / cycle.pieces
+    stops = jnp.concatenate([starts[:, 1:], end[:, None]], axis=1)
 
-    def row(ts: Array, xs: Array, within: State, ending: State) -> Array:
-        def guards(t: Scalar, x: Array) -> Array:
-            def by(state: State) -> Array:
-                return jnp.max(model.stacked(model.guards(t, cycle.unravel(x), state), -jnp.inf), axis=-1)
+    def piece(a: Scalar, b: Scalar, x: Array, within: State, ending: State) -> tuple[Array, Array, Array]:
+        def guards(t: Scalar, x: Array) -> list[list[Scalar]]:
+            return [row for state in (within, ending) for row in model.guards(t, cycle.unravel(x), state)]
 
-            return jnp.maximum(by(within), by(ending))
+        # What is far from zero is of no interest.
+        found = flows.minima(a, b, x, within, guards, lambda most: 0.1 * most)
+        return found.least, found.most, a + found.share * (b - a)
 
-        return jax.vmap(guards)(ts, xs)
-
-    values = jax.vmap(row)(ts, xs, cuts.within, cuts.ending)
-    size = jnp.max(jnp.abs(values), axis=(0, 1))
-    late = cuts.num < jnp.arange(len(ts), dtype=cuts.num.dtype)
-    short = jnp.where((values < -1e-7 * size) & ~late[:, None, None], -values, 0).max(-1)
+    rows = jax.vmap(jax.vmap(piece, (0, 0, 0, None, None)))
+    least, most, t = rows(starts, stops, x, cuts.within, cuts.ending)  # arcs, pieces, guards
+    size = jnp.max(jnp.maximum(jnp.abs(least), jnp.abs(most)), axis=(0, 1))
+    late = cuts.num < jnp.arange(len(begin), dtype=cuts.num.dtype)
+    short = jnp.where((least < -1e-7 * size) & ~late[:, None, None], -least, 0)
     worst = jnp.argmax(short)
-    return short.ravel()[worst], ts.ravel()[worst]
+    return short.ravel()[worst], t.ravel()[worst]

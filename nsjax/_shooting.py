@@ -49,10 +49,9 @@ def shoot(
     guess = lax.stop_gradient(y0)
     model = Model(still, jnp.ones_like(frozen(t0)), frozen(t0), guess)
     if autonomous:
-        guess, period = lax.stop_gradient(
+        guess, period, mode = lax.stop_gradient(
             base_point(still, frozen(t0), guess, lax.stop_gradient(period), sign, mode, how)
         )
-        mode = None
     flat, unravel = jfu.ravel_pytree(guess)
     first_period = lax.stop_gradient(period)
 
@@ -79,7 +78,7 @@ def shoot(
     at_rest = jnp.zeros((), bool)
     if autonomous:
         # Poincaré's phase condition: the base point stays on the section through the guess.
-        normal = ravel(model.flow(frozen(t0), guess, at_start(model, frozen(t0), guess)))
+        normal = ravel(model.flow(frozen(t0), guess, at_start(model, frozen(t0), guess, mode)))
         speed = normal @ normal
 
         def on_section(z: tuple, parameters: tuple) -> tuple:
@@ -107,7 +106,7 @@ def shoot(
     result = judge(good, x, points[:-1], autonomous, order)
     if autonomous:
         # Where Newton's method ends near an equilibrium, its Jacobian is singular and it seldom says that it converged.
-        last = ravel(model.flow(t0, unravel(x), at_start(model, t0, unravel(x))))
+        last = ravel(model.flow(t0, unravel(x), at_start(model, t0, unravel(x), mode)))
         at_rest = at_rest | (jnp.max(jnp.abs(last)) * first_period <= 1e-6 * size)
         result = RESULTS.where(at_rest, RESULTS.orbit_is_equilibrium, result)
 

@@ -33,19 +33,19 @@ def corner_tests(rows: int, slots: int) -> list[Test]:
     return of_segments + [Test("guard", i, j) for i in range(rows) for j in range(slots)]
 
 
-def corner_values(curve: OrbitCurve, look: Look, course: Course, least: Any) -> tuple[Any, Any]:
-    """Positive as long as the orbit is one, given the least values of guards; and which of these there are."""
+def corner_values(curve: OrbitCurve, look: Look, course: Course) -> tuple[Any, Any]:
+    """Positive as long as the orbit is one; and which of these there are."""
     xp = look.begin.__array_namespace__()
     index = xp.arange(len(look.begin), dtype=course.num.dtype)
     last, ends = course.num - 1, xp.asarray(course.ends)
     real, event = index <= last, ends == EVENT
     ends_before, ends_after = ends[xp.where(index == 0, last, index - 1)], ends[xp.where(index >= last, 0, index + 1)]
-    values = [-look.rates, look.margins, (look.end - look.begin) / curve.time, least.ravel()]
+    values = [-look.rates, look.margins, (look.end - look.begin) / curve.time, look.least.ravel()]
     there = [
         real & event & (ends_after != FREE),
         real & event & xp.isfinite(look.margins),
         real & (course.num > 1) & (ends != LEAST) & (ends_before != LEAST),
-        (real[:, None] & xp.isfinite(least)).ravel(),
+        (real[:, None] & xp.isfinite(look.least)).ravel(),
     ]
     return xp.concatenate(values), xp.concatenate(there)
 

@@ -283,6 +283,22 @@ def test_eigenvalues_that_stay_on_the_axis(change):
     assert [row[:3] for row in found(lambda q: direct_sum(TURN / 2, 0.5 * EYE), multipliers=True)] == [("pair", 1, 0)]
 
 
+def test_a_crossing_beside_a_defective_zero():
+    """Issue 20, item 20: the last digits of the entries move roots by the square root of rounding where two zeros that
+    stay are defective. They are one crossing with that of the third, not several."""
+    rng, eps = np.random.default_rng(0), np.finfo(float).eps
+
+    def jacobian(q):
+        j = mixed(direct_sum([[0, 1], [0, 0]], [[q - 0.5]], [[-1]]))
+        return j * (1 + eps * rng.integers(-2, 3, j.shape))
+
+    for _ in range(300):
+        stays, crosses = eigenvalue_crossings(jacobian(0.0), jacobian(1.0))
+        assert (stays.kind, stays.multiplicity, stays.q, stays.until) == ("zero", 2, 0, 1)
+        assert (crosses.kind, crosses.multiplicity, crosses.direction) == ("zero", 3, 1)
+        np.testing.assert_allclose(crosses.q, 0.5, atol=1e-12)
+
+
 def test_no_jump_and_one_dimension():
     assert eigenvalue_crossings([[1.0]], [[1.0]]) == []
     (c,) = eigenvalue_crossings([[0.0]], [[0.0]])

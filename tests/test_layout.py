@@ -18,6 +18,7 @@ ORDER = (
     "_progress",
     "_bracket",
     "_linear",
+    "_minima",
     "_structure",
     "_system",
     "_parameter",

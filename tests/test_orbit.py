@@ -7,6 +7,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 import reference
+import scipy.optimize
 from models import Hammer, Motion, pid, Plane
 
 import nsjax
@@ -281,6 +282,35 @@ def test_maximum():
     np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(amplitude)))(p), jax.hessian(exact)(p), rtol=1e-7)
 
 
+class TwoTones(nsjax.System):
+    """A damped oscillator forced at frequencies 1 and 0.97: its orbit has a hundred peaks, of which none is another."""
+
+    c: jax.Array | float = 0.3
+    period = 200 * np.pi
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - self.c * y.v + 0.1 * (jnp.cos(t) + jnp.cos(0.97 * t)))
+
+
+def two_tones(t, c=0.3):
+    return sum((0.1 * np.exp(1j * w * t) / (1 - w**2 + 1j * c * w)).real for w in (1, 0.97))
+
+
+def test_maximum_of_many_peaks():
+    """Issue 20, item 4, and pitfall 41: no fixed number of samples decides which of a hundred peaks is the largest."""
+    orbit = find_orbit(TwoTones(), Motion(0.0, 0.3), max_steps=20000)
+    ts = np.linspace(0, 200 * np.pi, 2_000_001)
+    for sign in (1, -1):
+        top = ts[np.argmax(sign * two_tones(ts))]
+        found = scipy.optimize.minimize_scalar(lambda t: -sign * two_tones(t), bracket=(top - 1e-3, top, top + 1e-3))
+        np.testing.assert_allclose(orbit.maximum(lambda t, y: sign * y.x), -found.fun, rtol=1e-11)
+    # What it was by 65 samples and Newton's method.
+    assert np.max(orbit.path().y.x) < 0.98 * np.max(two_tones(ts))
+    # A kink where it is least harms nothing; nor does a quantity that does not change.
+    np.testing.assert_allclose(orbit.maximum(lambda t, y: jnp.abs(y.x)), np.abs(two_tones(ts)).max(), rtol=1e-9)
+    np.testing.assert_allclose(orbit.maximum(lambda t, y: 0 * y.x + 2), 2, rtol=1e-15)
+
+
 def test_maximum_of_an_orbit_that_sticks(classic):
     """1 + √(1 + v²) in slip, at a state that Fig. 3.7 begins with; v_dr in stick, where it is not one place alone."""
     np.testing.assert_allclose(classic.maximum(lambda t, y: y.x), 1 + np.hypot(1, 0.2), rtol=1e-11)
@@ -451,5 +481,87 @@ def test_the_mode_of_a_relay_comes_back():
     found = find_orbit(Feedback(), guess, t0=t0, mode={"r": 1}, **METHOD)
     assert int(found.mode[0]) == 1
     np.testing.assert_allclose(found.multipliers, orbit.multipliers, rtol=1e-8)
-    off = find_orbit(Feedback(), guess, t0=t0, mode={"r": 0}, method="shooting", throw=False, **METHOD)
+    # (Under `jit` there is one try; else another one follows, from where the solution settles.)
+    off = eqx.filter_jit(lambda y: find_orbit(Feedback(), y, t0=t0, mode={"r": 0}, throw=False, **METHOD))(guess)
     assert not bool(nsjax.is_okay(off.result))
+    assert int(find_orbit(Feedback(), guess, t0=t0, mode={"r": 0}, **METHOD).mode[0]) == 1
+    # Issue 20, item 12: it is found without being told.
+    alone = find_orbit(Feedback(), guess, t0=t0, **METHOD)
+    assert int(alone.mode[0]) == 1
+    np.testing.assert_allclose(alone.y0, found.y0, rtol=1e-9)
+
+
+class Thermostat(nsjax.System):
+    """Heats below 0.9 until 1.1, towards `heat`: an orbit that never leaves the hysteresis."""
+
+    heat: jax.Array | float
+
+    def vector_field(self, t, y, s):
+        return -y + self.heat * s.on
+
+    @nsjax.relay
+    def on(self, t, y):
+        return 0.9 - y
+
+    @on.off
+    def on(self, t, y):
+        return y - 1.1
+
+
+@pytest.mark.parametrize("heat", [1.5, 3.0])
+@pytest.mark.parametrize("period", [None, 0.5])
+def test_an_orbit_within_the_hysteresis(heat, period):
+    """Issue 20, item 12: the base point lies in the longer arc, whichever mode that is of. Both in closed form."""
+    on, off = np.log((heat - 0.9) / (heat - 1.1)), np.log(1.1 / 0.9)
+    for method in ("shooting", "segments"):
+        orbit = find_orbit(Thermostat(heat), jnp.asarray(1.0), period=period, method=method, **METHOD)
+        np.testing.assert_allclose(orbit.period, on + off, rtol=1e-10)
+        assert int(orbit.mode[0]) == (on > off)
+
+
+class Held(nsjax.System):
+    """x'' = -x - 0.1 x' - sgn(x') + p(t), which comes to stick for ever."""
+
+    def push(self, t):
+        return 0.0
+
+    @nsjax.sgn
+    def friction(self, t, y):
+        return y.v
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - 0.1 * y.v - s.friction + self.push(t))
+
+
+class Driven(Held):
+    period = 2 * np.pi
+
+    def push(self, t):
+        return 0.3 * jnp.cos(t)
+
+
+@pytest.mark.parametrize(
+    "system, guess",
+    [(Held(), {}), (Held(), dict(period=6.0)), (Driven(), {})],
+    ids=["free", "period", "forced"],
+)
+@pytest.mark.parametrize("y0", [Motion(0.1, 0.0), Motion(3.0, 0.1)], ids=["at rest", "comes to rest"])
+def test_a_continuum_is_named(system, guess, y0):
+    """Issue 20, item 12: every x that friction can hold is an equilibrium, or an orbit."""
+    orbit = find_orbit(system, y0, throw=False, **guess, **METHOD)
+    assert orbit.result == RESULTS.orbit_sticks_for_ever and not bool(nsjax.is_okay(orbit.result))
+
+
+def test_an_equilibrium_that_slides_is_no_continuum():
+    """x' = -x on the surface y = 0 of y' = -sgn y: one point alone."""
+
+    class Sliding(nsjax.System):
+        @nsjax.sgn
+        def surface(self, t, y):
+            return y.v
+
+        def vector_field(self, t, y, s):
+            return Motion(-y.x, -s.surface)
+
+    orbit = find_orbit(Sliding(), Motion(1.0, 0.2), throw=False, **METHOD)
+    assert orbit.result == RESULTS.orbit_is_equilibrium

@@ -263,3 +263,34 @@ def test_violently_unstable(options):
     np.testing.assert_allclose(orbit.y0, [-1 / 101, 0], atol=1e-12)
     np.testing.assert_allclose(orbit.multipliers, np.exp([20 * np.pi, -20 * np.pi]), rtol=1e-8)
     assert not orbit.stable and orbit.admissible
+
+
+class Ceiling(nsjax.System):
+    """Forced at frequencies 1 and 0.97, below a ceiling beyond which something else would push."""
+
+    top: jax.Array | float
+    period = 200 * np.pi
+
+    @nsjax.sgn
+    def below(self, t, y):
+        return self.top - y.x
+
+    def vector_field(self, t, y, s):
+        forcing = 0.1 * (jnp.cos(t) + jnp.cos(0.97 * t))
+        return Motion(y.v, -y.x - 0.3 * y.v + forcing - 5 * (1 - s.below))
+
+
+def test_no_sample_decides_whether_an_orbit_is_admissible():
+    """Issue 20, item 4, and pitfall 41: a surface is passed at one of a hundred peaks, between any 65 samples."""
+    method = dict(stepsize_controller=pid(1e-12), max_steps=20000, max_events=1)
+    ts = np.linspace(0, 200 * np.pi, 2_000_001)
+    x = sum((0.1 * np.exp(1j * w * ts) / (1 - w**2 + 0.3j * w)).real for w in (1, 0.97))
+    segments = [Segment((1,), 200 * np.pi)]
+    for top in (0.66, 0.68):
+        orbit = find_orbit(Ceiling(top), Motion(0.0, 0.3), segments=segments, throw=False, **method)
+        assert orbit.residual < 1e-9 and orbit.path().y.x.max() < 0.65
+        assert orbit.admissible == (x.max() < top)
+        np.testing.assert_allclose(orbit.violation, max(0, x.max() - top), atol=1e-8)
+        if not orbit.admissible:
+            assert orbit.result == RESULTS.orbit_not_admissible
+            np.testing.assert_allclose(orbit.violation_t, ts[np.argmax(x)], atol=1e-3)

@@ -1,0 +1,84 @@
+"""The least values of functions along a path, however often they turn (pitfall 41), against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nsjax._minima import minima, THETA
+
+
+def along(*functions, orders=None, slack=0.0, span=1.0):
+    """Of functions of the time, each a list of parts of which it is the largest, all with as many."""
+
+    def sample(first, last, x):
+        ts = span * (first + (last - first) * jnp.asarray(THETA))
+        return ts, ts[:, None], last - first
+
+    def values(ts, xs):
+        rows = [jnp.stack([part(ts) for part in parts], axis=1) for parts in functions]
+        return [jnp.stack(rows, axis=1)], jnp.full(len(functions), slack)
+
+    orders = np.zeros((2, len(functions))) if orders is None else np.asarray(orders, float)
+    return jax.jit(lambda: minima(sample, values, jnp.zeros(1), jnp.asarray(orders)))()
+
+
+@pytest.mark.parametrize("peaks", [1, 7, 40, 300, 3000])
+def test_many_peaks(peaks):
+    """The deepest of many dips, whose depths change slowly from one to the next."""
+
+    def wave(t):
+        return jnp.cos(2 * np.pi * peaks * t) + 0.3 * jnp.cos(2 * np.pi * 0.97 * peaks * t + 1)
+
+    t = np.linspace(0, 1, 400 * peaks + 1)
+    t = t[np.argmin(np.asarray(wave(t)))]
+    slope = jax.grad(lambda t: wave(t))
+    for _ in range(20):
+        t = np.clip(t - slope(t) / jax.grad(slope)(t), 0, 1)
+    found = along([wave], [lambda t: -wave(t)])
+    np.testing.assert_allclose(found.least[0], wave(t), rtol=1e-9)
+    assert found.least[0] < float(wave(found.xs[:, 0]).min()) or peaks == 1
+    np.testing.assert_allclose(found.x[:, 0], found.share, atol=1e-9)
+    np.testing.assert_allclose(wave(found.share[0]), found.least[0], atol=1e-9)
+    np.testing.assert_allclose(found.sums, 1, rtol=1e-14)
+
+
+def test_dips_of_nearly_one_depth():
+    """Which of two dips is the deeper is not decided at the nodes, where one of them is seen and the other is not."""
+    for at in np.linspace(0.2, 0.3, 7):
+        low, high = at, at + 0.5
+        found = along([lambda t, low=low, high=high: (t - low) ** 2 * (t - high) ** 2 + 1e-9 * (t - low)])
+        np.testing.assert_allclose(found.share[0], low, atol=1e-6)
+        assert abs(found.least[0]) < 1e-12
+
+
+def test_kinks():
+    """A function with kinks is resolved by no polynomial, and where two parts of one meet is a kink."""
+    found = along([lambda t: jnp.abs(t - 1 / 3)], [lambda t: 2 - jnp.abs(jnp.cos(40 * t))])
+    np.testing.assert_allclose(found.least, [0, 1], atol=1e-6)
+    found = along([lambda t: jnp.exp(t - 0.3) - 1, lambda t: 0.3 - t], [lambda t: (t - 0.7) ** 2, lambda t: -1 - t])
+    np.testing.assert_allclose(found.least, 0, atol=1e-8)
+    np.testing.assert_allclose(found.share, [0.3, 0.7], atol=1e-6)
+
+
+@pytest.mark.parametrize("before, after", [(1, 0), (1, 1), (2, 1), (0, 2), (3, 0)])
+def test_zeros_at_the_ends(before, after):
+    """Divided by them, it is least inside; a dip that comes down to zero is seen with them."""
+
+    def rest(t):
+        return 1 + t + 0.999 * jnp.sin(30 * t)
+
+    def guard(t):
+        return t**before * (1 - t) ** after * rest(t)
+
+    t = np.linspace(1e-3, 1 - 1e-3, 1_000_001)
+    found = along([guard], orders=[[before], [after]])
+    np.testing.assert_allclose(found.least[0], np.asarray(rest(t)).min(), rtol=1e-7, atol=1e-9)
+
+
+def test_noise_ends():
+    """What is all rounding is not resolved for ever: told how much does not matter, it is done at once."""
+    found = along([lambda t: 1e-13 * jnp.sin(1e9 * t)], slack=1e-9)
+    assert abs(found.least[0]) <= 2e-13
+    found = along([lambda t: jnp.full_like(t, jnp.nan)])
+    assert not np.isfinite(found.least[0])
