@@ -14,6 +14,8 @@ PACKAGE = pathlib.Path(__file__).parents[1] / "nsjax"
 ORDER = (
     "_version",
     "_types",
+    "_text",
+    "_results",
     "_once",
     "_progress",
     "_bracket",
@@ -40,6 +42,8 @@ ORDER = (
     "_settle",
     "_event",
     "_check",
+    "_arguments",
+    "_diagnosis",
     "_start",
     "_flow",
     "_solve",
