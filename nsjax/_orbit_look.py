@@ -13,7 +13,7 @@ from ._course import Course, EVENT, FREE, TIME
 from ._filippov import Model
 from ._floquet import floquet, structural_zeros
 from ._implicit import find_root
-from ._minima import Minima, minima, RESOLVED
+from ._minima import grouped, in_order, Minima, minima, places_of, RESOLVED
 from ._orbit_curve import OrbitCurve, row_sizes
 from ._segment_flow import with_parameter
 from ._system import relay
