@@ -150,6 +150,25 @@ def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
     return sticks & (values[-1] <= 1e-9 * values[0])
 
 
+def held_throughout(system: System, begin: Array, end: Array, modes: Array) -> Bool[Array, ""]:
+    """Whether friction holds a solution along all of its arcs. (At the edge of the continuum it lets go for the root of
+    what rounding is.)"""
+    length = jnp.maximum(end - begin, 0)
+    free = [
+        jnp.sum(jnp.where(modes[:, i] == 0, 0, length)) for i, k in enumerate(system.switches) if isinstance(k, sgn)
+    ]
+    return jnp.any(jnp.asarray(free, length.dtype) <= 1e-3 * jnp.sum(length))
+
+
+@eqx.filter_jit
+def repeats_held(system: System, t0: Scalar, y: Y, period: Scalar, mode: Any, method: dict) -> Bool[Array, ""]:
+    """Whether a state of a forced system comes back, held by friction all the time."""
+    sol = solve(system, t0, t0 + period, y, mode=mode, throw=False, **method)
+    begin, end, _, modes = arcs(sol, t0, y)
+    back = distance(ravel(sol.y1), ravel(y)) <= 1e-8 * (1 + jnp.max(jnp.abs(ravel(y))))
+    return is_okay(sol.result) & back & held_throughout(system, begin, end, modes)
+
+
 def _laps(
     system: System, t0: Scalar, y0: Y, sign: float, mode: Any, method: dict, number: int
 ) -> tuple[Y, tuple, Float[Array, "laps n"]]:

@@ -237,9 +237,10 @@ def _guards_along(
     states there."""
     model, n = with_parameter(curve.model, curve.path, look.parameter), len(curve.sizes)
     orders = jnp.concatenate([jnp.zeros((2, 2 * n), orders.dtype), orders], axis=1)
-    rows = look.begin, look.end, look.x, course.mode, course.part
-    a, b, x, mode, part = (jnp.asarray(column)[row] for column in rows)
-    found = along_segment(curve, model, look.parameter, a, b, x, mode, part, orders, turns=False)
+    a, b, x = (jnp.asarray(column)[row] for column in (look.begin, look.end, look.x))
+    mode, part = jnp.asarray(course.mode)[row], jnp.asarray(course.part)[row]
+    value = jnp.asarray(look.parameter)
+    found = along_segment(curve, model, value, a, b, x, mode, part, orders, turns=False)
     return found.least[2 * n :], found.share[2 * n :], found.x[2 * n :]
 
 

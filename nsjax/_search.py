@@ -9,12 +9,12 @@ import jax.lax as lax
 import jax.numpy as jnp
 
 from ._cuts import cuts_from, cuts_near, Segment
-from ._guess import of_relays, repeats, settle_down, sticks_anywhere, undecided
+from ._guess import held_throughout, of_relays, repeats, repeats_held, settle_down, sticks_anywhere, undecided
 from ._orbit import Orbit
 from ._results import is_okay, RESULTS
 from ._segments import by_segments
 from ._shooting import shoot
-from ._system import frozen, sgn, System
+from ._system import frozen, System
 from ._types import Scalar, Y
 
 
@@ -72,6 +72,10 @@ class Search(NamedTuple):
             if rests:
                 orbit = eqx.tree_at(lambda o: o.result, orbit, self._at_rest(system, start))
             if period > 0:
+                # A state that repeats itself, and is not found as a root: it is not isolated.
+                forced = system.period is not None and not self.backward
+                if forced and repeats_held(frozen(system), self.t0, start, period * order, mode, self.how):
+                    return eqx.tree_at(lambda o: o.result, orbit, RESULTS.orbit_sticks_for_ever)
                 second = self._tries(system, start, period, order, mode)
                 orbit = second if bool(is_okay(second.result)) else orbit
         return orbit
@@ -127,6 +131,5 @@ class Search(NamedTuple):
 
 def _neutral(orbit: Orbit) -> bool:
     """Whether friction holds a forced orbit for all of its period, and lets others beside it repeat themselves too."""
-    switches, modes = orbit.system.switches, orbit.arcs.mode[: int(orbit.events.num) + 1]
-    held = any(isinstance(k, sgn) and bool(jnp.all(modes[:, i] == 0)) for i, k in enumerate(switches))
-    return held and bool(jnp.any(jnp.abs(orbit.multipliers - 1) <= 1e-6))
+    held = held_throughout(orbit.system, orbit.arcs.begin, orbit.arcs.end, orbit.arcs.mode)
+    return bool(held & jnp.any(jnp.abs(orbit.multipliers - 1) <= 1e-6))
