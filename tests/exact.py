@@ -9,13 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
+from trajectory import CROWDED, EDGE, first_roots, GAIN, Sensitive, Trajectory, Unsolvable, until_sensitive
 
 
-EPS = 1e-7  # how near to a tangency, or to another event, a guard may come before the case is called sensitive
 DEGREE = 26  # of the Taylor polynomials, on steps with |M| h = 1.5: the remainder is below 1e-23
-CROWDED = 1e-6  # the shortest time between events
 FLIGHT = 1e-4  # the shortest flight between impacts
-GAIN = 1e6  # the largest amplification of errors
 
 
 class Shape(NamedTuple):
@@ -48,28 +46,6 @@ class Case(NamedTuple):
     omega: np.ndarray
     y0: np.ndarray
     t1: np.ndarray
-
-
-class Trajectory(NamedTuple):
-    t1: float
-    t: np.ndarray  # (events,)
-    switch: np.ndarray  # (events,)
-    modes: np.ndarray  # (events, switches), after each
-    y1: np.ndarray
-    mode1: np.ndarray
-    jacobian: np.ndarray
-    gain: float  # how much an error made on the way, or in an event time, may grow until t1
-    gains: np.ndarray  # the same for the time of each event
-    ends: str  # "" at t1; else "no mode": no assignment of stick and slip satisfies the laws at the last event
-    cut: str  # why t1 was moved before an event that is too sensitive
-
-
-class Sensitive(Exception):
-    """The solution here depends on digits that a numerical method does not have."""
-
-
-class Unsolvable(Exception):
-    """No assignment of stick and slip is consistent."""
 
 
 def generate(rng: np.random.Generator, shape: Shape) -> Case:
@@ -124,50 +100,6 @@ def generate(rng: np.random.Generator, shape: Shape) -> Case:
             G[k, n] = max(G[k, n], 0.1 - G[k] @ np.concatenate([y0, [0, 1, 0]]))
     bound = np.where((rng.random(m) < 0.5) & (np.sum(G[:m, :n].T * D[:, :m], 0) < 0), rng.uniform(1.05, 2, m), 1.0)
     return Case(F, D, G, off, bound, e, np.array(rng.uniform(0.5, 4)), y0, np.array(rng.uniform(3, 8)))
-
-
-# Nodes of the first look at a polynomial on [0, 1], and the half width of the interval that each stands for.
-_HALF = 1 / 16
-_NODES = _HALF * (2 * np.arange(8) + 1)
-_VALUES = _NODES[:, None] ** np.arange(DEGREE + 1)
-_SLOPES = np.arange(DEGREE + 1) * _NODES[:, None] ** np.maximum(np.arange(DEGREE + 1) - 1, 0)
-_BEND = np.arange(DEGREE + 1) * (np.arange(DEGREE + 1) - 1.0)
-
-
-def _root(c: np.ndarray, begin: float) -> float:
-    """The first root on [begin, 1] of Σ c_j u^j, which is positive before; infinite if there is none.
-
-    An interval is left behind only if midpoint value, slope and curvature bound exclude that p <= EPS on it.
-    """
-    bend = _BEND[: len(c)] @ abs(c)
-    power = c[::-1]
-    slope = np.polyder(power)
-    stack = [(begin, 1.0)]
-    while stack:
-        a, b = stack.pop()
-        middle, half = 0.5 * (a + b), 0.5 * (b - a)
-        value, rate = np.polyval(power, middle) - EPS, np.polyval(slope, middle)
-        if value - abs(rate) * half - 0.5 * bend * half**2 > 0:
-            continue
-        if abs(rate) <= bend * half:
-            if half < 1e-9:
-                raise Sensitive("tangency")
-            stack += [(middle, b), (a, middle)]
-        elif rate > 0:  # rises all along: so it was below EPS before
-            if np.polyval(power, a) < EPS:
-                raise Sensitive("tangency")
-        elif np.polyval(power, b) <= EPS:  # falls all along: Newton's method from where the root certainly is ahead
-            u = a
-            for _ in range(60):
-                step = np.polyval(power, u) / np.polyval(slope, u)
-                u = min(max(u - step, a), b + half)
-                if abs(step) < 1e-16:
-                    break
-            # The root is simple enough for the next one not to matter: p > EPS / 2 until here, and p < 0 soon after.
-            if np.polyval(slope, u) ** 2 < 4 * bend * EPS or abs(np.polyval(power, u)) > 1e-13 * (1 + sum(abs(c))):
-                raise Sensitive("tangency")
-            return u
-    return np.inf
 
 
 class _Field(NamedTuple):
@@ -277,7 +209,7 @@ class _Exact:
                 elif k not in leaves or self.case.bound[k] > 1:  # else dh/dt = 0 at this instant
                     slack.append(s * (self.case.G[k] @ M @ z))
             least = min(slack, default=1.0)
-            if abs(least) < 1e-5:
+            if abs(least) < EDGE:
                 raise Sensitive("at the edge of sliding")
             if least > 0:
                 valid.append(tuple(trial))
@@ -299,16 +231,10 @@ class _Exact:
                 for i, guard in enumerate(field.guards):
                     if guard in known:
                         c[i] = np.concatenate([c[i, known[guard] :], np.zeros(known[guard])])
-            bend = abs(c) @ _BEND
-            low = c @ _VALUES.T - abs(c @ _SLOPES.T) * _HALF - 0.5 * bend[:, None] * _HALF**2
-            roots = np.full(len(c), np.inf)
-            for i in np.flatnonzero(low.min(1) <= EPS):
-                begin = 2 * _HALF * np.argmax(low[i] <= EPS)
-                if gone + begin * field.h < limit:
-                    try:
-                        roots[i] = gone + field.h * _root(c[i], begin)
-                    except Sensitive as problem:
-                        raise Sensitive(*problem.args, gone + begin * field.h) from None
+            try:
+                roots = gone + field.h * first_roots(c, (limit - gone) / field.h)
+            except Sensitive as problem:
+                raise Sensitive(problem.args[0], gone + problem.args[1] * field.h) from None
             first = np.sort(roots)
             if first[0] < np.inf:
                 if len(first) > 1 and first[1] - first[0] < CROWDED:
@@ -441,13 +367,5 @@ class _Exact:
 
 def solve(case: Case, shape: Shape, max_events: int = 40) -> Trajectory | None:
     """The exact solution; up to a time before it gets sensitive, or nothing if that is at once."""
-    exact, t1, cut = _Exact(case, shape), float(case.t1), ""
-    for _ in range(8):
-        try:
-            return exact.run(t1, max_events, cut)
-        except Sensitive as problem:
-            cut = problem.args[0]
-            t1 = problem.args[1] - 10**-1.5
-            if t1 < 0.1:
-                return None
-    return None
+    exact = _Exact(case, shape)
+    return until_sensitive(lambda t1, cut: exact.run(t1, max_events, cut), float(case.t1))

@@ -14,6 +14,7 @@ import pytest
 from exact import Case, Shape
 from jaxtyping import Array
 from models import pid
+from trajectory import count, share, Solved, told_but_ambiguous
 
 import nsjax
 
@@ -29,7 +30,6 @@ SHAPES = {
     "all": (Shape(6, 3, 2, 1, forced=False, moving=False), dfx.Tsit5()),
 }
 MAX_EVENTS = 40
-TOLERANCE = 1e-8
 
 
 class Affine(nsjax.System):
@@ -114,66 +114,16 @@ def run(cases: Case, shape: Shape, solver: dfx.AbstractSolver, derive: bool) -> 
     return jax.vmap(one)(cases)
 
 
-def compare(truth: exact.Trajectory, got: list) -> str:
-    """Empty if they agree, else in what they do not. What may be off grows with what errors grow by."""
-    t, switch, modes, y1, mode1, jacobian, solved, ambiguous = got
-    if not solved:
-        return ""
-    if truth.ends:
-        return truth.ends
-    number = int(np.sum(np.isfinite(t)))
-    t, switch, modes = t[:number], switch[:number], modes[:number]
-    if number != len(truth.t) or np.any(switch != truth.switch):
-        return "events"
-    # Of events at one instant only the last leaves a mode that lasts.
-    lasts = np.append(np.diff(truth.t) > 0, True)[:number]
-    if np.any((modes != truth.modes)[lasts]) or np.any(mode1 != truth.mode1):
-        return "modes"
-    if not np.all(abs(t - truth.t) <= TOLERANCE * (1 + truth.gains)):
-        return "times"
-    if not np.max(abs(y1 - truth.y1)) <= TOLERANCE * (1 + truth.gain):
-        return "state"
-    if jacobian is not None and not np.max(abs(jacobian - truth.jacobian)) <= TOLERANCE * (1 + truth.gain) ** 2:
-        return "derivative"
-    return ""
-
-
-def fuzz(name: str, count: int, seed: int, derive: bool) -> tuple[collections.Counter, list]:
+def fuzz(name: str, number: int, seed: int, derive: bool) -> tuple[collections.Counter, list]:
     """How many cases agree, are told by a status, are too sensitive to compare; and those that are wrong."""
     (shape, solver), rng = SHAPES[name], np.random.default_rng(seed)
-    cases = [exact.generate(rng, shape) for _ in range(count)]
+    cases = [exact.generate(rng, shape) for _ in range(number)]
     truths = [exact.solve(case, shape, MAX_EVENTS) for case in cases]
     # What has no solution must be told, and so gets a little longer.
     ends = [0.1 if t is None else t.t1 + 0.1 * (t.ends != "") for t in truths]
     batch = Case(*(np.stack(column) for column in zip(*[c._replace(t1=np.array(e)) for c, e in zip(cases, ends)])))
     out = [None if x is None else np.asarray(x) for x in run(batch, shape, solver, derive)]
-    tally, wrong = collections.Counter(), []
-    for i, truth in enumerate(truths):
-        if truth is None:
-            tally["sensitive"] += 1
-            continue
-        got = [None if x is None else x[i] for x in out]
-        difference = compare(truth, got)
-        kind = "wrong" if difference else "agreed" if got[-2] else "told"
-        tally[kind] += 1
-        if kind == "told" and not truth.ends:
-            tally["needlessly told"] += 1
-            tally["needlessly told ambiguous"] += bool(got[-1])
-        tally["cut short"] += truth.cut != ""
-        tally["events"] += len(truth.t)
-        if difference:
-            wrong.append((name, seed, i, difference))
-    return tally, wrong
-
-
-def share(tally: collections.Counter, key: str) -> float:
-    return tally[key] / sum(tally[kind] for kind in ("agreed", "told", "sensitive", "wrong"))
-
-
-def told_but_ambiguous(tally: collections.Counter) -> int:
-    """How many that have a solution were not solved, for another reason than that no mode was found. (With strong
-    coupling of switches the search for one may fail, but says so.)"""
-    return tally["needlessly told"] - tally["needlessly told ambiguous"]
+    return count(truths, Solved(*out), (name, seed))
 
 
 @pytest.mark.parametrize("name", ["friction", "corners", "relays"])
