@@ -9,7 +9,6 @@ guards on a step is isolated on their polynomials.
 
 import functools
 import itertools
-import math
 from operator import mul
 from typing import NamedTuple
 
@@ -27,7 +26,7 @@ SINES = 3
 NEAR = 1e-6  # differences for derivatives, of which a per mille will do
 
 _mp = mpmath.mp.clone()
-_mp.prec = BITS + 20
+_mp.prec = 200
 
 
 class Shape(NamedTuple):
@@ -90,7 +89,7 @@ def generate(rng: np.random.Generator, shape: Shape) -> Case:
         D[k][:, product], D[k][:, sine] = 0.15 * sparse(n, n), 0.15 * sparse(n, SINES)
     bound = np.where(rng.random(m) < 0.4, rng.uniform(1.05, 2, m), 1.0)
     W, phase = rng.normal(size=(SINES, n)), rng.uniform(0, 2 * np.pi, SINES)
-    t1 = rng.uniform(1, 3)
+    t1 = rng.uniform(2, 5)
     return Case(F, D, G, W, phase, bound, np.array(rng.uniform(0.5, 4)), rng.normal(size=n), np.array(t1))
 
 
@@ -102,7 +101,7 @@ def fixed(x: float) -> int:
 class _Jet:
     """The series of all features along a solution, of which that of the state is given order by order."""
 
-    def __init__(self, oracle: "_Curved", t: int):
+    def __init__(self, oracle: "Curved", t: int):
         self.n, self.W, self.phase = oracle.shape.n, oracle.W, oracle.phase
         n, forced = self.n, oracle.timed
         self.z: list[list[int]] = [[] for _ in range(oracle.shape.features)]
@@ -154,13 +153,10 @@ class _Jet:
             if series:
                 series.pop()
 
-    def at(self, row: list[tuple[int, int]], k: int) -> int:
-        """The coefficient of order k of a combination of features."""
-        return sum(c * self.z[q][k] for c, q in row) >> BITS
-
-
-def _sparse(row: list[int]) -> list[tuple[int, int]]:
-    return [(int(c), q) for q, c in enumerate(row) if c]
+    def of_order(self, k: int, rows: list[list[int]]) -> list[int]:
+        """The coefficients of order k of combinations of features."""
+        z = [series[k] for series in self.z]
+        return [sum(map(mul, row, z)) >> BITS for row in rows]
 
 
 def _value(series: list[int], t: int) -> int:
@@ -179,21 +175,23 @@ class _Arc(NamedTuple):
     h: float
 
 
-class _Curved:
+class Curved:
+    """One case. `exactly` gathers the times of events and in the end the state, in units of 1 / ONE."""
+
     def __init__(self, case: Case, shape: Shape):
         self.case, self.shape = case, shape
         self.timed = shape.forced or shape.moving
         exact = np.vectorize(fixed, otypes=[object])
         self.F, self.D, self.W = exact(case.F), exact(case.D), exact(case.W).tolist()
         self.phase, self.omega = exact(case.phase).tolist(), fixed(case.omega)
-        self.G = [_sparse(row) for row in exact(case.G)]
-        self.push = [[_sparse(row) for row in rows] for rows in self.D]
+        self.G, self.push = exact(case.G).tolist(), self.D.tolist()
         self.bound = [fixed(b) for b in case.bound]
+        self.exactly: list[int] = []
         self.rows = functools.cache(self.free_field)
 
-    def free_field(self, mode: tuple) -> list[list[tuple[int, int]]]:
+    def free_field(self, mode: tuple) -> list[list[int]]:
         """The rows of F + Σ s_k D_k, with 0 for those that slide."""
-        return [_sparse(row) for row in self.F + sum(s * d for s, d in zip(mode, self.D))]
+        return (self.F + sum(s * d for s, d in zip(mode, self.D))).tolist()
 
     def expand(self, t: int, y: list[int], mode: tuple) -> _Arc:
         """The series from here. While it slides every next order of the state is affine in that of the multipliers, with
@@ -202,17 +200,17 @@ class _Curved:
         held = [k for k in range(len(mode)) if mode[k] == 0]
         lam: list[list[int]] = [[] for _ in held]
         push: list[list[list[int]]] = [[[] for _ in range(n)] for _ in held]
-        inverse = []
+        surfaces, inverse = [self.G[k] for k in held], []
         jet.extend(y)
         for k in range(ORDER):
-            rate = [jet.at(row, k) for row in rows]
+            rate = jet.of_order(k, rows)
             if held:
                 for j, which in enumerate(held):
-                    for i in range(n):
-                        push[j][i].append(jet.at(self.push[which][i], k))
+                    for i, d in enumerate(jet.of_order(k, self.push[which])):
+                        push[j][i].append(d)
                         rate[i] += sum(map(mul, lam[j], push[j][i][:0:-1])) >> BITS
                 jet.extend([r // (k + 1) for r in rate])
-                off = [jet.at(self.G[j], k + 1) for j in held]
+                off = jet.of_order(k + 1, surfaces)
                 jet.drop()
                 if k == 0:
                     inverse = self.inverse(jet, rate, off, [[d[0] for d in p] for p in push], held)
@@ -227,10 +225,10 @@ class _Curved:
             for c, j in zip(series[:-4:-1], range(len(series) - 1, 0, -1)):
                 if c:
                     h = min(h, (LEFT * ONE / abs(c)) ** (1 / j))
-        guards, names = [], []
+        guards, names, surface = [], [], [jet.of_order(j, self.G) for j in range(ORDER + 1)]
         for k, s in enumerate(mode):
             if s:
-                guards.append([s * jet.at(self.G[k], j) for j in range(ORDER + 1)])
+                guards.append([s * row[k] for row in surface])
                 names.append((k, 0))
             else:
                 series = lam[held.index(k)]
@@ -244,8 +242,8 @@ class _Curved:
         matrix = _mp.matrix(len(held))
         for j, push in enumerate(pushes):
             jet.extend([r + d for r, d in zip(rate, push)])
-            for i, k in enumerate(held):
-                matrix[i, j] = _mp.mpf(jet.at(self.G[k], 1) - off[i]) / ONE
+            for i, changed in enumerate(jet.of_order(1, [self.G[k] for k in held])):
+                matrix[i, j] = _mp.mpf(changed - off[i]) / ONE
             jet.drop()
         inverse = matrix**-1
         return [[int(_mp.ldexp(inverse[i, j], BITS)) for j in range(len(held))] for i in range(len(held))]
@@ -260,7 +258,9 @@ class _Curved:
         angle = y @ case.W.T + case.phase
         wave = np.array([np.cos(case.omega * t), np.sin(case.omega * t)]) * self.timed
         turned = case.omega * np.array([-wave[1], wave[0]])
-        z = np.concatenate([np.ones((batch, 1)), y, y * following, y * square, np.sin(angle), np.tile(wave, (batch, 1))], 1)
+        z = np.concatenate(
+            [np.ones((batch, 1)), y, y * following, y * square, np.sin(angle), np.tile(wave, (batch, 1))], 1
+        )
         by_y = np.zeros((batch, self.shape.features, n))
         by_y[:, 1 : 1 + n] = eye
         by_y[:, 1 + n : 1 + 2 * n] = following[:, :, None] * eye + y[:, :, None] * np.roll(eye, 1, 1)
@@ -314,12 +314,12 @@ class _Curved:
         """The assignment of stick and slip to the switches at their surfaces that satisfies all laws, by trying all; of
         several the one that holds most. One that holds a surface which repels would be chosen by rule only."""
         valid = []
+        all_held = tuple(0 if k in at else s for k, s in enumerate(mode))
+        repels = dict(zip(at, np.diag(self.law(t, y[None], all_held)[3][0]) >= 0))
         for choice in itertools.product(*[(leaves[k],) if k in leaves else (0, 1, -1) for k in at]):
             trial = list(mode)
             for k, s in zip(at, choice):
                 trial[k] = s
-            matrix = self.law(t, y[None], tuple(0 if k in at else s for k, s in enumerate(mode)))[3][0]
-            repels = np.diag(matrix) >= 0
             s, rates = (x[0] for x in self.checked(t, y, tuple(trial))[1:3])
             slack = []
             for k, side in zip(at, choice):
@@ -331,7 +331,7 @@ class _Curved:
             if abs(least) < EDGE:
                 raise Sensitive("at the edge of sliding")
             if least > 0:
-                if any(side == 0 and r for side, r in zip(choice, repels)):
+                if any(side == 0 and repels[k] for k, side in zip(at, choice)):
                     raise Sensitive("repels")
                 valid.append(tuple(trial))
         if not valid:
@@ -427,11 +427,13 @@ class _Curved:
             f = self.law(now, here[None], after)[0][0]
             growth = np.concatenate([(np.eye(n) + np.outer(f - before, row) / slope) @ growth, np.eye(n)[None]])
             mode = after
+            self.exactly.append(t)
             times, switches, modes = [*times, now], [*switches, k], [*modes, mode]
             if np.max(np.linalg.norm(growth, axis=(1, 2))) > GAIN:
                 raise Sensitive("chaos", now)
         if np.max(np.linalg.norm(growth, axis=(1, 2))) > GAIN:
             raise Sensitive("chaos", t1)
+        self.exactly += y
         return self.trajectory(t1, times, switches, modes, y, mode, growth, gains, "", cut)
 
     def trajectory(
@@ -454,5 +456,5 @@ class _Curved:
 
 def solve(case: Case, shape: Shape, max_events: int = 40) -> Trajectory | None:
     """The solution; up to a time before it gets sensitive, or nothing if that is at once."""
-    oracle = _Curved(case, shape)
+    oracle = Curved(case, shape)
     return until_sensitive(lambda t1, cut: oracle.run(t1, max_events, cut), float(case.t1))
