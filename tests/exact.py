@@ -1,7 +1,8 @@
 """Random piecewise-affine systems, and their solutions by matrix exponentials: an oracle that shares nothing with nsjax.
 
 With z = (y, 1, cos ωt, sin ωt) every mode is z' = M z, multipliers are rows times z, and so is every guard. Its first
-root is found from Taylor polynomials with a bound on their curvature, so that none can be missed.
+root is found from Taylor polynomials with a bound on their curvature, so that none can be missed. Functions of time that
+jump (`clocked.py`) are further components of z, affine between the ticks.
 """
 
 import itertools
@@ -114,16 +115,16 @@ class _Field(NamedTuple):
     taylor: np.ndarray  # (guards, DEGREE + 1, n + 3): coefficients per component of z
 
 
-class _Exact:
+class Exact:
     """One case, and its modes as they are met."""
 
     def __init__(self, case: Case, shape: Shape):
         self.case, self.shape = case, shape
-        self.size = shape.n + 3
+        self.size = case.F.shape[1]
         self.kinds = ["sgn"] * shape.sgn + ["relay"] * shape.relay + ["impact"] * shape.impact
         self.base = np.zeros((self.size, self.size))
         self.base[: shape.n] = case.F
-        self.base[-2, -1], self.base[-1, -2] = -case.omega, case.omega
+        self.base[shape.n + 1, shape.n + 2], self.base[shape.n + 2, shape.n + 1] = -case.omega, case.omega
         self.D = np.zeros((self.size, shape.switches))
         self.D[: shape.n] = case.D
         # What a multiplier keeps constant: h of a sliding switch, dh/dt of a contact (nothing but velocities).
@@ -245,7 +246,7 @@ class _Exact:
         return np.inf, (-1, 0)
 
     def start(self) -> tuple[np.ndarray, tuple]:
-        z = np.concatenate([self.case.y0, [1, 1, 0]])
+        z = np.concatenate([self.case.y0, [1, 1, 0], self.signals()])
         h = self.case.G @ z
         mode = [0] * len(h)
         for k, kind in enumerate(self.kinds):
@@ -262,25 +263,48 @@ class _Exact:
         R = np.eye(self.size) - (1 + self.case.e[k - self.shape.sgn - self.shape.relay]) * np.outer(push, rate) / (
             rate @ push
         )
-        after = R @ z
-        toggled = []
         for j, kind in enumerate(self.kinds):
             if kind == "impact" and mode[j] == 1 and self.level[j] @ push != 0:
                 raise Sensitive("impact on what rests")
-            if kind == "sgn" and self.case.G[j] @ push != 0:
+        return R, self.carried(R @ z, push, mode, at)
+
+    def carried(self, after: np.ndarray, push: np.ndarray, mode: list, at: set[int]) -> list[int]:
+        """The relays that switch where z jumps in the components in which `push` is not zero; `mode` and `at` are
+        brought up to date: what is carried off a surface, or across it, is on the side where it then is."""
+        toggled = []
+        for j, kind in enumerate(self.kinds):
+            if not np.any(self.case.G[j] * push):
+                continue
+            if kind == "sgn":
                 h = self.case.G[j] @ after
                 if abs(h) < 1e-6:
                     raise Sensitive("simultaneous")
                 mode[j] = int(np.sign(h))
                 at.discard(j)
-            elif kind == "relay" and self.case.G[j] @ push != 0:
+            elif kind == "relay":
                 h = (self.case.off[j - self.shape.sgn] if mode[j] else self.case.G[j]) @ after
                 if abs(h) < 1e-6:
                     raise Sensitive("simultaneous")
                 if h > 0:
                     mode[j] = 1 - mode[j]
                     toggled.append(j)
-        return R, toggled
+        return toggled
+
+    def signals(self) -> np.ndarray:
+        """The functions of time that jump, at the start."""
+        return np.zeros(0)
+
+    def next_tick(self) -> tuple[float, int]:
+        """When functions of time jump next, and which clock does it."""
+        return np.inf, -1
+
+    def tick(self, z: np.ndarray, clock: int) -> np.ndarray:
+        """z after it."""
+        raise NotImplementedError
+
+    def counts(self) -> tuple[int, ...]:
+        """How often each clock has ticked."""
+        return ()
 
     def run(self, t1: float, max_events: int, cut: str) -> Trajectory:
         z, mode = self.start()
@@ -293,31 +317,40 @@ class _Exact:
             raise Sensitive("start", 0.0)
         ends = ""
         while True:
-            field = self.field(mode)
+            field, (tick, clock) = self.field(mode), self.next_tick()
+            stop = min(t1, tick)
             try:
-                length, (k, sign) = self.next_root(field, z, t1 + CROWDED - t, known)
+                length, (k, sign) = self.next_root(field, z, stop + CROWDED - t, known)
             except Sensitive as problem:
                 raise Sensitive(problem.args[0], t + (problem.args[1] if len(problem.args) > 1 else 0)) from None
-            if t + length >= t1:
-                if t + length < t1 + CROWDED:
-                    raise Sensitive("at the end", t + length)
-                flow = expm(field.M * (t1 - t))
-                z, growth, t = flow @ z, flow @ growth, t1
+            if t + length < stop + CROWDED and t + length >= stop or abs(tick - t1) < CROWDED:
+                raise Sensitive("at the end", stop)
+            ticks = t + length > stop
+            length = stop - t if ticks else length
+            flow = expm(field.M * length)
+            z, growth, t = flow @ z, flow @ growth, stop if ticks else t + length
+            if t == t1:
                 if np.max(np.linalg.norm(growth[:, :n, :n], axis=(1, 2))) > GAIN:
                     raise Sensitive("chaos", t)
                 break
-            flow = expm(field.M * length)
-            z, growth, t = flow @ z, flow @ growth, t + length
-            row, before = field.rows[field.guards.index((k, sign))], field.M @ z
             at = {j for j in range(len(mode)) if self.holds(j, mode)}
             leaves, R, toggled, new = {}, np.eye(self.size), [], list(mode)
-            gains.append(np.sum(np.linalg.norm(row @ growth, axis=-1)) / abs(row @ before))
+            if ticks:
+                k, sign, row = self.shape.switches + clock, 0, np.zeros(self.size)
+                gains.append(0.0)
+            else:
+                row, before = field.rows[field.guards.index((k, sign))], field.M @ z
+                gains.append(np.sum(np.linalg.norm(row @ growth, axis=-1)) / abs(row @ before))
             try:
                 if length < CROWDED and times:
                     raise Sensitive("crowded")
                 if len(times) >= max_events:
                     raise Sensitive("many events")
-                if sign:
+                if ticks:
+                    jumped = self.tick(z, clock)
+                    toggled = self.carried(jumped, jumped != z, new, at)
+                    R[:, n] += jumped - z  # (its value is 1)
+                elif sign:
                     leaves[k] = sign  # (what rests leaves whatever that is)
                 elif self.kinds[k] == "sgn":
                     at.add(k)
@@ -334,29 +367,29 @@ class _Exact:
             except Sensitive as problem:
                 raise Sensitive(problem.args[0], t) from None
             except Unsolvable:
-                times, switches, modes = [*times, t], [*switches, k], [*modes, mode]
+                times, switches, modes = [*times, t], [*switches, k], [*modes, (*mode, *self.counts())]
                 ends = "no mode"
                 break
             known = {(j, 0): 1 for j in at if self.kinds[j] == "sgn" and after[j] != 0}
-            if self.kinds[k] == "impact":
+            if not ticks and self.kinds[k] == "impact":
                 known[k, 0] = 3 if sign else 2 if k in at else 1
             elif sign and self.case.bound[k] == 1:
                 known[k, 0] = 2
-            S = R + np.outer(self.law(after)[0] @ R @ z - R @ before, row) / (row @ before)
+            S = R if ticks else R + np.outer(self.law(after)[0] @ R @ z - R @ before, row) / (row @ before)
             z, mode = R @ z, after
             growth = np.concatenate([S @ growth, np.eye(self.size)[None]])
             if np.max(np.linalg.norm(growth[:, :n, :n], axis=(1, 2))) > GAIN:
                 raise Sensitive("chaos", t)
             for j in (k, *toggled):
-                times, switches, modes = [*times, t], [*switches, j], [*modes, mode]
+                times, switches, modes = [*times, t], [*switches, j], [*modes, (*mode, *self.counts())]
             gains += [gains[-1]] * len(toggled)
         return Trajectory(
             t,
             np.array(times),
             np.array(switches, int),
-            np.array(modes, int).reshape(len(times), len(mode)),
+            np.array(modes, int).reshape(len(times), len(mode) + len(self.counts())),
             z[:n],
-            np.array(mode),
+            np.array([*mode, *self.counts()]),
             growth[0, :n, :n],
             float(np.sum(np.linalg.norm(growth[:, :n, :n], axis=(1, 2)))),
             np.array(gains),
@@ -367,5 +400,5 @@ class _Exact:
 
 def solve(case: Case, shape: Shape, max_events: int = 40) -> Trajectory | None:
     """The exact solution; up to a time before it gets sensitive, or nothing if that is at once."""
-    exact = _Exact(case, shape)
+    exact = Exact(case, shape)
     return until_sensitive(lambda t1, cut: exact.run(t1, max_events, cut), float(case.t1))

@@ -2,17 +2,14 @@
 
 import collections
 import functools
-from typing import Any
 
 import diffrax as dfx
-import equinox as eqx
 import exact
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from affine import Affine
 from exact import Case, Shape
-from jaxtyping import Array
 from models import pid
 from trajectory import count, share, Solved, told_but_ambiguous
 
@@ -30,57 +27,6 @@ SHAPES = {
     "all": (Shape(6, 3, 2, 1, forced=False, moving=False), dfx.Tsit5()),
 }
 MAX_EVENTS = 40
-
-
-class Affine(nsjax.System):
-    """`exact.Case` as a model; columns that are zero for a shape are left out, so that their structure is known."""
-
-    F: Array
-    D: Array
-    G: Array
-    off: Array
-    bound: Array
-    e: Array
-    omega: Array
-    shape: Shape = eqx.field(static=True)
-
-    def extended(self, t, y, clock):
-        ticks = [jnp.cos(self.omega * t), jnp.sin(self.omega * t)] if clock else []
-        return jnp.concatenate([y, jnp.ones(1), *[x[None] for x in ticks]])
-
-    def vector_field(self, t, y, s):
-        z, n = self.extended(t, y, self.shape.forced), self.shape.positions
-        force = self.F[n:, : len(z)] @ z + self.D[n:] @ jnp.stack([s[k.name] for k in self.switches])
-        return jnp.concatenate([y[n : 2 * n], force])
-
-    def surface(self, row, t, y):
-        z = self.extended(t, y, self.shape.moving)
-        return row[: len(z)] @ z
-
-    def gap(self, row, t, y):
-        z, n = self.extended(t, y, self.shape.moving), self.shape.positions
-        return row[:n] @ z[:n] + row[self.shape.n : len(z)] @ z[self.shape.n :]
-
-    @property
-    def switches(self):
-        return _switches(self.shape)
-
-
-@functools.cache
-def _switches(shape: Shape) -> tuple[Any, ...]:
-    out: list[Any] = []
-    for k in range(shape.sgn):
-        switch = nsjax.sgn(lambda self, t, y, k=k: self.surface(self.G[k], t, y), name=f"s{k}")
-        out.append(switch.breakaway(lambda self, k=k: self.bound[k]))
-    for i in range(shape.relay):
-        k = len(out)
-        switch = nsjax.relay(lambda self, t, y, k=k: self.surface(self.G[k], t, y), name=f"r{i}")
-        out.append(switch.off(lambda self, t, y, i=i: self.surface(self.off[i], t, y)))
-    for i in range(shape.impact):
-        k = len(out)
-        switch = nsjax.impact(lambda self, t, y, k=k: self.gap(self.G[k], t, y), name=f"c{i}")
-        out.append(switch.restitution(lambda self, i=i: self.e[i]))
-    return tuple(out)
 
 
 # Compiling is what takes long, not running.
