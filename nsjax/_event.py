@@ -286,6 +286,9 @@ def land(
                 h0 = jnp.min(jnp.stack(model.h(k, te, before)))
                 h1 = jnp.min(jnp.stack(later.h(k, te, after)))
                 slack = jnp.max(later.rounding(lambda t, y, k=k: later.h(k, t, y), te, after, size))
+                if model.clocks:  # time is shifted a little off a tick, to either side of it
+                    shift, still = 2 * (model.margin(te) + later.margin(te)), jax.tree.map(jnp.zeros_like, after)
+                    slack += jnp.max(later.sizes(lambda t, y, k=k: later.h(k, t, y), te, after, shift, still))
                 moved, off = jnp.abs(h1 - h0) > slack, jnp.abs(h1) > slack
                 modes[k] = jnp.where(moved & off, jnp.sign(h1).astype(jnp.int32), modes[k])
                 roots[k] = jnp.where(moved, 0, roots[k])

@@ -162,10 +162,14 @@ class Model(eqx.Module):
             passed[k] = switch.count(self.system, frozen(t * self.direction), self.direction > 0)
         return passed
 
+    def tick(self, k: int, mode: Mode) -> Scalar:
+        """When time, increasing as the flow sees it, meets the next tick of clock k."""
+        low, high = self.span(k, mode)
+        return jnp.where(self.direction > 0, high, -low)
+
     def next_tick(self, mode: Mode) -> Scalar:
-        """When time, increasing as the flow sees it, meets the next tick."""
-        ends = [self.span(k, mode) for k in self.clocks]
-        return ft.reduce(jnp.minimum, [jnp.where(self.direction > 0, high, -low) for low, high in ends])
+        """The same of the clock that ticks first."""
+        return ft.reduce(jnp.minimum, [self.tick(k, mode) for k in self.clocks])
 
     def time(self, t: Scalar) -> Scalar:
         """The time of the user, kept between the ticks of the mode.
@@ -177,12 +181,17 @@ class Model(eqx.Module):
         t = t * self.direction
         if self.window is None:
             return t
-        low, high = self.window
-        size = ft.reduce(jnp.maximum, [jnp.where(jnp.isfinite(x), jnp.abs(x), 0) for x in (low, high, frozen(t))])
-        margin = 100 * float(jnp.finfo(t.dtype).eps) * size + float(jnp.finfo(t.dtype).tiny) ** 0.75
+        (low, high), margin = self.window, self.margin(t)
         shift = jnp.where(t < low + margin, 2 * margin, 0) - jnp.where(t > high - margin, 2 * margin, 0)
         kept = jnp.where(t < low - margin, low + margin, t + shift)
         return jnp.where(t > high + margin, high - margin, kept)
+
+    def margin(self, t: Scalar) -> Scalar:
+        """How near to a tick time is within rounding of it; there it is shifted by twice as much."""
+        assert self.window is not None
+        ends = (*self.window, frozen(t))
+        size = ft.reduce(jnp.maximum, [jnp.where(jnp.isfinite(x), jnp.abs(x), 0) for x in ends])
+        return 100 * float(jnp.finfo(t.dtype).eps) * size + float(jnp.finfo(t.dtype).tiny) ** 0.75
 
     # The smooth field for given switch values, and the indicator functions.
 

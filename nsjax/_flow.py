@@ -148,7 +148,8 @@ class Flow(eqx.Module):
 
     def touches(self, c: Carry, step: Step) -> list[list[Bool[Array, ""]]]:
         """Which guards fall to zero at the very end of the solution, but for rounding of the time, of the step (whose
-        weights are numbers of some tens), or of their own."""
+        weights are numbers of some tens), or of their own; and the ticks at which the step ends. (The time that is left
+        until a tick is not zero there if a product and a difference are rounded as one.)"""
         length = frozen(step.t_next) - frozen(c.t)
         eps = float(jnp.finfo(length.dtype).eps)
         far = 4 * eps * jnp.abs(frozen(step.t_next)) / jnp.where(length > 0, length, 1) + 256 * eps
@@ -159,7 +160,12 @@ class Flow(eqx.Module):
 
         final = (step.t_next >= self.t1) & (length > 0)
         pairs = [zip(*rows) for rows in zip(frozen(step.guards), frozen(step.noise))]
-        return [[final & touches(c, noise) for c, noise in row] for row in pairs]
+        rows = [[final & touches(c, noise) for c, noise in row] for row in pairs]
+        for i, slot in enumerate(self.model.slots):
+            if slot.switch in self.model.clocks:
+                tick = frozen(self.model.tick(slot.switch, c.state.mode))
+                rows[i] = [step.t_next >= tick - 4 * eps * jnp.abs(tick)]
+        return rows
 
     def pace(self, c: Carry, step: Step) -> tuple[Any, Any, PyTree, Any]:
         """Whether a step is accurate enough, the length of the next, and the controller's state and verdict."""

@@ -1,7 +1,8 @@
 """Random piecewise-affine systems, and their solutions by matrix exponentials: an oracle that shares nothing with nsjax.
 
 With z = (y, 1, cos ωt, sin ωt) every mode is z' = M z, multipliers are rows times z, and so is every guard. Its first
-root is found from Taylor polynomials with a bound on their curvature, so that none can be missed.
+root is found from Taylor polynomials with a bound on their curvature, so that none can be missed. Functions of time that
+jump (`clocked.py`) are further components of z, affine between the ticks.
 """
 
 import itertools
@@ -9,13 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
+from trajectory import CROWDED, EDGE, first_roots, GAIN, Sensitive, Trajectory, Unsolvable, until_sensitive
 
 
-EPS = 1e-7  # how near to a tangency, or to another event, a guard may come before the case is called sensitive
 DEGREE = 26  # of the Taylor polynomials, on steps with |M| h = 1.5: the remainder is below 1e-23
-CROWDED = 1e-6  # the shortest time between events
 FLIGHT = 1e-4  # the shortest flight between impacts
-GAIN = 1e6  # the largest amplification of errors
 
 
 class Shape(NamedTuple):
@@ -48,28 +47,6 @@ class Case(NamedTuple):
     omega: np.ndarray
     y0: np.ndarray
     t1: np.ndarray
-
-
-class Trajectory(NamedTuple):
-    t1: float
-    t: np.ndarray  # (events,)
-    switch: np.ndarray  # (events,)
-    modes: np.ndarray  # (events, switches), after each
-    y1: np.ndarray
-    mode1: np.ndarray
-    jacobian: np.ndarray
-    gain: float  # how much an error made on the way, or in an event time, may grow until t1
-    gains: np.ndarray  # the same for the time of each event
-    ends: str  # "" at t1; else "no mode": no assignment of stick and slip satisfies the laws at the last event
-    cut: str  # why t1 was moved before an event that is too sensitive
-
-
-class Sensitive(Exception):
-    """The solution here depends on digits that a numerical method does not have."""
-
-
-class Unsolvable(Exception):
-    """No assignment of stick and slip is consistent."""
 
 
 def generate(rng: np.random.Generator, shape: Shape) -> Case:
@@ -126,50 +103,6 @@ def generate(rng: np.random.Generator, shape: Shape) -> Case:
     return Case(F, D, G, off, bound, e, np.array(rng.uniform(0.5, 4)), y0, np.array(rng.uniform(3, 8)))
 
 
-# Nodes of the first look at a polynomial on [0, 1], and the half width of the interval that each stands for.
-_HALF = 1 / 16
-_NODES = _HALF * (2 * np.arange(8) + 1)
-_VALUES = _NODES[:, None] ** np.arange(DEGREE + 1)
-_SLOPES = np.arange(DEGREE + 1) * _NODES[:, None] ** np.maximum(np.arange(DEGREE + 1) - 1, 0)
-_BEND = np.arange(DEGREE + 1) * (np.arange(DEGREE + 1) - 1.0)
-
-
-def _root(c: np.ndarray, begin: float) -> float:
-    """The first root on [begin, 1] of Σ c_j u^j, which is positive before; infinite if there is none.
-
-    An interval is left behind only if midpoint value, slope and curvature bound exclude that p <= EPS on it.
-    """
-    bend = _BEND[: len(c)] @ abs(c)
-    power = c[::-1]
-    slope = np.polyder(power)
-    stack = [(begin, 1.0)]
-    while stack:
-        a, b = stack.pop()
-        middle, half = 0.5 * (a + b), 0.5 * (b - a)
-        value, rate = np.polyval(power, middle) - EPS, np.polyval(slope, middle)
-        if value - abs(rate) * half - 0.5 * bend * half**2 > 0:
-            continue
-        if abs(rate) <= bend * half:
-            if half < 1e-9:
-                raise Sensitive("tangency")
-            stack += [(middle, b), (a, middle)]
-        elif rate > 0:  # rises all along: so it was below EPS before
-            if np.polyval(power, a) < EPS:
-                raise Sensitive("tangency")
-        elif np.polyval(power, b) <= EPS:  # falls all along: Newton's method from where the root certainly is ahead
-            u = a
-            for _ in range(60):
-                step = np.polyval(power, u) / np.polyval(slope, u)
-                u = min(max(u - step, a), b + half)
-                if abs(step) < 1e-16:
-                    break
-            # The root is simple enough for the next one not to matter: p > EPS / 2 until here, and p < 0 soon after.
-            if np.polyval(slope, u) ** 2 < 4 * bend * EPS or abs(np.polyval(power, u)) > 1e-13 * (1 + sum(abs(c))):
-                raise Sensitive("tangency")
-            return u
-    return np.inf
-
-
 class _Field(NamedTuple):
     """One mode: z' = M z, the guards that watch it, and what is needed to look for their roots."""
 
@@ -182,16 +115,16 @@ class _Field(NamedTuple):
     taylor: np.ndarray  # (guards, DEGREE + 1, n + 3): coefficients per component of z
 
 
-class _Exact:
+class Exact:
     """One case, and its modes as they are met."""
 
     def __init__(self, case: Case, shape: Shape):
         self.case, self.shape = case, shape
-        self.size = shape.n + 3
+        self.size = case.F.shape[1]
         self.kinds = ["sgn"] * shape.sgn + ["relay"] * shape.relay + ["impact"] * shape.impact
         self.base = np.zeros((self.size, self.size))
         self.base[: shape.n] = case.F
-        self.base[-2, -1], self.base[-1, -2] = -case.omega, case.omega
+        self.base[shape.n + 1, shape.n + 2], self.base[shape.n + 2, shape.n + 1] = -case.omega, case.omega
         self.D = np.zeros((self.size, shape.switches))
         self.D[: shape.n] = case.D
         # What a multiplier keeps constant: h of a sliding switch, dh/dt of a contact (nothing but velocities).
@@ -278,7 +211,7 @@ class _Exact:
                 else:
                     slack.append(s * (self.case.G[k] @ M @ z))
             least = min(slack, default=1.0)
-            if abs(least) < 1e-5:
+            if abs(least) < EDGE:
                 raise Sensitive("at the edge of sliding")
             if least > 0:
                 valid.append(tuple(trial))
@@ -318,16 +251,10 @@ class _Exact:
                 for i, guard in enumerate(field.guards):
                     if guard in known:
                         c[i] = np.concatenate([c[i, known[guard] :], np.zeros(known[guard])])
-            bend = abs(c) @ _BEND
-            low = c @ _VALUES.T - abs(c @ _SLOPES.T) * _HALF - 0.5 * bend[:, None] * _HALF**2
-            roots = np.full(len(c), np.inf)
-            for i in np.flatnonzero(low.min(1) <= EPS):
-                begin = 2 * _HALF * np.argmax(low[i] <= EPS)
-                if gone + begin * field.h < limit:
-                    try:
-                        roots[i] = gone + field.h * _root(c[i], begin)
-                    except Sensitive as problem:
-                        raise Sensitive(*problem.args, gone + begin * field.h) from None
+            try:
+                roots = gone + field.h * first_roots(c, (limit - gone) / field.h)
+            except Sensitive as problem:
+                raise Sensitive(problem.args[0], gone + problem.args[1] * field.h) from None
             first = np.sort(roots)
             if first[0] < np.inf:
                 if len(first) > 1 and first[1] - first[0] < CROWDED:
@@ -338,7 +265,7 @@ class _Exact:
         return np.inf, (-1, 0)
 
     def start(self) -> tuple[np.ndarray, tuple]:
-        z = np.concatenate([self.case.y0, [1, 1, 0]])
+        z = np.concatenate([self.case.y0, [1, 1, 0], self.signals()])
         h = self.case.G @ z
         mode = [0] * len(h)
         for k, kind in enumerate(self.kinds):
@@ -355,25 +282,48 @@ class _Exact:
         R = np.eye(self.size) - (1 + self.case.e[k - self.shape.sgn - self.shape.relay]) * np.outer(push, rate) / (
             rate @ push
         )
-        after = R @ z
-        toggled = []
         for j, kind in enumerate(self.kinds):
             if kind == "impact" and mode[j] == 1 and self.level[j] @ push != 0:
                 raise Sensitive("impact on what rests")
-            if kind == "sgn" and self.case.G[j] @ push != 0:
+        return R, self.carried(R @ z, push, mode, at)
+
+    def carried(self, after: np.ndarray, push: np.ndarray, mode: list, at: set[int]) -> list[int]:
+        """The relays that switch where z jumps in the components in which `push` is not zero; `mode` and `at` are
+        brought up to date: what is carried off a surface, or across it, is on the side where it then is."""
+        toggled = []
+        for j, kind in enumerate(self.kinds):
+            if not np.any(self.case.G[j] * push):
+                continue
+            if kind == "sgn":
                 h = self.case.G[j] @ after
                 if abs(h) < 1e-6:
                     raise Sensitive("simultaneous")
                 mode[j] = int(np.sign(h))
                 at.discard(j)
-            elif kind == "relay" and self.case.G[j] @ push != 0:
+            elif kind == "relay":
                 h = (self.case.off[j - self.shape.sgn] if mode[j] else self.case.G[j]) @ after
                 if abs(h) < 1e-6:
                     raise Sensitive("simultaneous")
                 if h > 0:
                     mode[j] = 1 - mode[j]
                     toggled.append(j)
-        return R, toggled
+        return toggled
+
+    def signals(self) -> np.ndarray:
+        """The functions of time that jump, at the start."""
+        return np.zeros(0)
+
+    def next_tick(self) -> tuple[float, int]:
+        """When functions of time jump next, and which clock does it."""
+        return np.inf, -1
+
+    def tick(self, z: np.ndarray, clock: int) -> np.ndarray:
+        """z after it."""
+        raise NotImplementedError
+
+    def counts(self) -> tuple[int, ...]:
+        """How often each clock has ticked."""
+        return ()
 
     def run(self, t1: float, max_events: int, cut: str) -> Trajectory:
         z, mode = self.start()
@@ -386,31 +336,40 @@ class _Exact:
             raise Sensitive("start", 0.0)
         ends = ""
         while True:
-            field = self.field(mode)
+            field, (tick, clock) = self.field(mode), self.next_tick()
+            stop = min(t1, tick)
             try:
-                length, (k, sign) = self.next_root(field, z, t1 + CROWDED - t, known)
+                length, (k, sign) = self.next_root(field, z, stop + CROWDED - t, known)
             except Sensitive as problem:
                 raise Sensitive(problem.args[0], t + (problem.args[1] if len(problem.args) > 1 else 0)) from None
-            if t + length >= t1:
-                if t + length < t1 + CROWDED:
-                    raise Sensitive("at the end", t + length)
-                flow = expm(field.M * (t1 - t))
-                z, growth, t = flow @ z, flow @ growth, t1
+            if t + length < stop + CROWDED and t + length >= stop or abs(tick - t1) < CROWDED:
+                raise Sensitive("at the end", stop)
+            ticks = t + length > stop
+            length = stop - t if ticks else length
+            flow = expm(field.M * length)
+            z, growth, t = flow @ z, flow @ growth, stop if ticks else t + length
+            if t == t1:
                 if np.max(np.linalg.norm(growth[:, :n, :n], axis=(1, 2))) > GAIN:
                     raise Sensitive("chaos", t)
                 break
-            flow = expm(field.M * length)
-            z, growth, t = flow @ z, flow @ growth, t + length
-            row, before = field.rows[field.guards.index((k, sign))], field.M @ z
             at = {j for j in range(len(mode)) if self.holds(j, mode)}
             leaves, R, toggled, new = {}, np.eye(self.size), [], list(mode)
-            gains.append(np.sum(np.linalg.norm(row @ growth, axis=-1)) / abs(row @ before))
+            if ticks:
+                k, sign, row = self.shape.switches + clock, 0, np.zeros(self.size)
+                gains.append(0.0)
+            else:
+                row, before = field.rows[field.guards.index((k, sign))], field.M @ z
+                gains.append(np.sum(np.linalg.norm(row @ growth, axis=-1)) / abs(row @ before))
             try:
                 if length < CROWDED and times:
                     raise Sensitive("crowded")
                 if len(times) >= max_events:
                     raise Sensitive("many events")
-                if sign:
+                if ticks:
+                    jumped = self.tick(z, clock)
+                    toggled = self.carried(jumped, jumped != z, new, at)
+                    R[:, n] += jumped - z  # (its value is 1)
+                elif sign:
                     leaves[k] = sign  # (what rests leaves whatever that is)
                 elif self.kinds[k] == "sgn":
                     at.add(k)
@@ -427,29 +386,29 @@ class _Exact:
             except Sensitive as problem:
                 raise Sensitive(problem.args[0], t) from None
             except Unsolvable:
-                times, switches, modes = [*times, t], [*switches, k], [*modes, mode]
+                times, switches, modes = [*times, t], [*switches, k], [*modes, (*mode, *self.counts())]
                 ends = "no mode"
                 break
             known = {(j, 0): 1 for j in at if self.kinds[j] == "sgn" and after[j] != 0}
-            if self.kinds[k] == "impact":
+            if not ticks and self.kinds[k] == "impact":
                 known[k, 0] = 3 if sign else 2 if k in at else 1
             elif sign and self.case.bound[k] == 1:
                 known[k, 0] = 2
-            S = R + np.outer(self.law(after)[0] @ R @ z - R @ before, row) / (row @ before)
+            S = R if ticks else R + np.outer(self.law(after)[0] @ R @ z - R @ before, row) / (row @ before)
             z, mode = R @ z, after
             growth = np.concatenate([S @ growth, np.eye(self.size)[None]])
             if np.max(np.linalg.norm(growth[:, :n, :n], axis=(1, 2))) > GAIN:
                 raise Sensitive("chaos", t)
             for j in (k, *toggled):
-                times, switches, modes = [*times, t], [*switches, j], [*modes, mode]
+                times, switches, modes = [*times, t], [*switches, j], [*modes, (*mode, *self.counts())]
             gains += [gains[-1]] * len(toggled)
         return Trajectory(
             t,
             np.array(times),
             np.array(switches, int),
-            np.array(modes, int).reshape(len(times), len(mode)),
+            np.array(modes, int).reshape(len(times), len(mode) + len(self.counts())),
             z[:n],
-            np.array(mode),
+            np.array([*mode, *self.counts()]),
             growth[0, :n, :n],
             float(np.sum(np.linalg.norm(growth[:, :n, :n], axis=(1, 2)))),
             np.array(gains),
@@ -460,13 +419,5 @@ class _Exact:
 
 def solve(case: Case, shape: Shape, max_events: int = 40) -> Trajectory | None:
     """The exact solution; up to a time before it gets sensitive, or nothing if that is at once."""
-    exact, t1, cut = _Exact(case, shape), float(case.t1), ""
-    for _ in range(8):
-        try:
-            return exact.run(t1, max_events, cut)
-        except Sensitive as problem:
-            cut = problem.args[0]
-            t1 = problem.args[1] - 10**-1.5
-            if t1 < 0.1:
-                return None
-    return None
+    exact = Exact(case, shape)
+    return until_sensitive(lambda t1, cut: exact.run(t1, max_events, cut), float(case.t1))

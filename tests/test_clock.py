@@ -343,3 +343,39 @@ def test_kinks_are_no_jumps():
     assert sol.result == RESULTS.successful and len(sol.events) == 1
     event = sol.events[0]
     np.testing.assert_allclose(event.y_after.x, abs(float(event.t) % 0.5 - 0.25), atol=1e-9)
+
+
+class Belt(nsjax.System):
+    """A block that sticks to a belt whose speed changes smoothly, pushed by a square wave."""
+
+    T: float = 0.65
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - 3 * s.belt + 0.05 * jnp.where(t / self.T % 2 < 1, 1.0, -1.0))
+
+    @nsjax.clock
+    def edges(self):
+        return self.T
+
+    @nsjax.clock
+    def twice(self):
+        return self.T / 2
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y.v - 0.3 * jnp.cos(2 * t)
+
+
+def test_ticks_while_sticking():
+    """A surface that moves but does not jump holds on over a tick; every tick is met, whatever rounding makes of the time
+    that is left until it (a product and a difference rounded as one), and so are two at one instant."""
+    sol = nsjax.solve(Belt(), 0.0, 12.0, Motion(0.2, 1.0), stepsize_controller=pid(1e-10))
+    assert sol.result == RESULTS.successful
+    met = {name: [float(e.t) for e in sol.events if e.switch == name] for name in ("belt", "edges", "twice")}
+    assert len(met["belt"]) == 1
+    np.testing.assert_array_equal(met["edges"], 0.65 * np.arange(1, 19))
+    np.testing.assert_array_equal(met["twice"], 0.325 * np.arange(1, 37))
+    start = met["belt"][0]
+    np.testing.assert_allclose(sol.y1.v, 0.3 * np.cos(24.0), atol=1e-12)
+    x = sol.events[0].y_after.x + 0.15 * (np.sin(24.0) - np.sin(2 * start))
+    np.testing.assert_allclose(sol.y1.x, x, atol=1e-9)

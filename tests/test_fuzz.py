@@ -2,18 +2,16 @@
 
 import collections
 import functools
-from typing import Any
 
 import diffrax as dfx
-import equinox as eqx
 import exact
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from affine import Affine
 from exact import Case, Shape
-from jaxtyping import Array
 from models import pid
+from trajectory import count, share, Solved, told_but_ambiguous
 
 import nsjax
 
@@ -29,58 +27,6 @@ SHAPES = {
     "all": (Shape(6, 3, 2, 1, forced=False, moving=False), dfx.Tsit5()),
 }
 MAX_EVENTS = 40
-TOLERANCE = 1e-8
-
-
-class Affine(nsjax.System):
-    """`exact.Case` as a model; columns that are zero for a shape are left out, so that their structure is known."""
-
-    F: Array
-    D: Array
-    G: Array
-    off: Array
-    bound: Array
-    e: Array
-    omega: Array
-    shape: Shape = eqx.field(static=True)
-
-    def extended(self, t, y, clock):
-        ticks = [jnp.cos(self.omega * t), jnp.sin(self.omega * t)] if clock else []
-        return jnp.concatenate([y, jnp.ones(1), *[x[None] for x in ticks]])
-
-    def vector_field(self, t, y, s):
-        z, n = self.extended(t, y, self.shape.forced), self.shape.positions
-        force = self.F[n:, : len(z)] @ z + self.D[n:] @ jnp.stack([s[k.name] for k in self.switches])
-        return jnp.concatenate([y[n : 2 * n], force])
-
-    def surface(self, row, t, y):
-        z = self.extended(t, y, self.shape.moving)
-        return row[: len(z)] @ z
-
-    def gap(self, row, t, y):
-        z, n = self.extended(t, y, self.shape.moving), self.shape.positions
-        return row[:n] @ z[:n] + row[self.shape.n : len(z)] @ z[self.shape.n :]
-
-    @property
-    def switches(self):
-        return _switches(self.shape)
-
-
-@functools.cache
-def _switches(shape: Shape) -> tuple[Any, ...]:
-    out: list[Any] = []
-    for k in range(shape.sgn):
-        switch = nsjax.sgn(lambda self, t, y, k=k: self.surface(self.G[k], t, y), name=f"s{k}")
-        out.append(switch.breakaway(lambda self, k=k: self.bound[k]))
-    for i in range(shape.relay):
-        k = len(out)
-        switch = nsjax.relay(lambda self, t, y, k=k: self.surface(self.G[k], t, y), name=f"r{i}")
-        out.append(switch.off(lambda self, t, y, i=i: self.surface(self.off[i], t, y)))
-    for i in range(shape.impact):
-        k = len(out)
-        switch = nsjax.impact(lambda self, t, y, k=k: self.gap(self.G[k], t, y), name=f"c{i}")
-        out.append(switch.restitution(lambda self, i=i: self.e[i]))
-    return tuple(out)
 
 
 # Compiling is what takes long, not running.
@@ -114,66 +60,16 @@ def run(cases: Case, shape: Shape, solver: dfx.AbstractSolver, derive: bool) -> 
     return jax.vmap(one)(cases)
 
 
-def compare(truth: exact.Trajectory, got: list) -> str:
-    """Empty if they agree, else in what they do not. What may be off grows with what errors grow by."""
-    t, switch, modes, y1, mode1, jacobian, solved, ambiguous = got
-    if not solved:
-        return ""
-    if truth.ends:
-        return truth.ends
-    number = int(np.sum(np.isfinite(t)))
-    t, switch, modes = t[:number], switch[:number], modes[:number]
-    if number != len(truth.t) or np.any(switch != truth.switch):
-        return "events"
-    # Of events at one instant only the last leaves a mode that lasts.
-    lasts = np.append(np.diff(truth.t) > 0, True)[:number]
-    if np.any((modes != truth.modes)[lasts]) or np.any(mode1 != truth.mode1):
-        return "modes"
-    if not np.all(abs(t - truth.t) <= TOLERANCE * (1 + truth.gains)):
-        return "times"
-    if not np.max(abs(y1 - truth.y1)) <= TOLERANCE * (1 + truth.gain):
-        return "state"
-    if jacobian is not None and not np.max(abs(jacobian - truth.jacobian)) <= TOLERANCE * (1 + truth.gain) ** 2:
-        return "derivative"
-    return ""
-
-
-def fuzz(name: str, count: int, seed: int, derive: bool) -> tuple[collections.Counter, list]:
+def fuzz(name: str, number: int, seed: int, derive: bool) -> tuple[collections.Counter, list]:
     """How many cases agree, are told by a status, are too sensitive to compare; and those that are wrong."""
     (shape, solver), rng = SHAPES[name], np.random.default_rng(seed)
-    cases = [exact.generate(rng, shape) for _ in range(count)]
+    cases = [exact.generate(rng, shape) for _ in range(number)]
     truths = [exact.solve(case, shape, MAX_EVENTS) for case in cases]
     # What has no solution must be told, and so gets a little longer.
     ends = [0.1 if t is None else t.t1 + 0.1 * (t.ends != "") for t in truths]
     batch = Case(*(np.stack(column) for column in zip(*[c._replace(t1=np.array(e)) for c, e in zip(cases, ends)])))
     out = [None if x is None else np.asarray(x) for x in run(batch, shape, solver, derive)]
-    tally, wrong = collections.Counter(), []
-    for i, truth in enumerate(truths):
-        if truth is None:
-            tally["sensitive"] += 1
-            continue
-        got = [None if x is None else x[i] for x in out]
-        difference = compare(truth, got)
-        kind = "wrong" if difference else "agreed" if got[-2] else "told"
-        tally[kind] += 1
-        if kind == "told" and not truth.ends:
-            tally["needlessly told"] += 1
-            tally["needlessly told ambiguous"] += bool(got[-1])
-        tally["cut short"] += truth.cut != ""
-        tally["events"] += len(truth.t)
-        if difference:
-            wrong.append((name, seed, i, difference))
-    return tally, wrong
-
-
-def share(tally: collections.Counter, key: str) -> float:
-    return tally[key] / sum(tally[kind] for kind in ("agreed", "told", "sensitive", "wrong"))
-
-
-def told_but_ambiguous(tally: collections.Counter) -> int:
-    """How many that have a solution were not solved, for another reason than that no mode was found. (With strong
-    coupling of switches the search for one may fail, but says so.)"""
-    return tally["needlessly told"] - tally["needlessly told ambiguous"]
+    return count(truths, Solved(*out), (name, seed))
 
 
 @pytest.mark.parametrize("name", ["friction", "corners", "relays"])

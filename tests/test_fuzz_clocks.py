@@ -1,0 +1,119 @@
+"""The flow against exact solutions of random piecewise-affine systems with functions of time that jump (issue 20: clocks,
+square waves, sawteeth, tables, in fields and guards): same events, times, states, modes, derivatives, both ways in time."""
+
+import functools
+
+import clocked
+import diffrax as dfx
+import equinox as eqx
+import exact
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from affine import Affine, switches
+from clocked import Case, Clocks, Shape
+from models import pid
+from trajectory import count, share, Solved, told_but_ambiguous
+
+import nsjax
+
+
+# One compiled program each.
+SHAPES = {
+    "friction": (Shape(exact.Shape(2, 2, 0, 0, forced=True, moving=True), ("periodic", "listed")), dfx.Tsit5()),
+    "relay": (Shape(exact.Shape(3, 1, 1, 0, forced=True, moving=True), ("periodic", "periodic")), dfx.Tsit5()),
+    "contact": (Shape(exact.Shape(4, 1, 0, 1, forced=True, moving=True), ("periodic",)), dfx.Tsit5()),
+}
+MAX_EVENTS = 60
+
+
+class Clocked(Affine):
+    """`clocked.Case` as a model, written as a user would."""
+
+    clocks: Clocks
+    kinds: tuple[str, ...] = eqx.field(static=True)
+
+    def signals(self, t):
+        out = []
+        for i, kind in enumerate(self.kinds):
+            period, offset, times, levels = (x[i] for x in self.clocks)
+            if kind == "periodic":
+                phase = (t - offset) / period
+                out += [jnp.where(jnp.floor(phase) % 2 == 0, levels[0], levels[1]), phase % 1.0]
+            else:
+                passed = jnp.searchsorted(times, t, side="right")
+                out += [levels[passed], t - jnp.append(0.0, times)[passed]]
+        return jnp.stack(out)
+
+    @property
+    def switches(self):
+        return (*switches(self.shape), *_clocks(self.kinds))
+
+
+@functools.cache
+def _clocks(kinds: tuple[str, ...]) -> tuple[nsjax.clock, ...]:
+    def made(i: int, kind: str) -> nsjax.clock:
+        if kind == "listed":
+            return nsjax.clock(lambda self: self.clocks.times[i], name=f"t{i}")
+        return nsjax.clock(lambda self: self.clocks.period[i], name=f"t{i}").offset(lambda self: self.clocks.offset[i])
+
+    return tuple(made(i, kind) for i, kind in enumerate(kinds))
+
+
+# Compiling is what takes long, not running.
+@functools.partial(
+    jax.jit, static_argnames=("shape", "solver", "derive"), compiler_options={"xla_backend_optimization_level": 0}
+)
+def run(cases: Case, shape: Shape, solver: dfx.AbstractSolver, derive: bool) -> tuple[Solved, jax.Array | None]:
+    """The solutions, and the derivatives of the state at the end by the periods of the clocks."""
+
+    def one(case: Case):
+        def flow(y0, period):
+            clocks = case.clocks._replace(period=period)
+            sol = nsjax.solve(
+                Clocked(*case.plain[:7], shape.plain, clocks, shape.clocks),
+                0.0,
+                case.plain.t1,
+                y0,
+                solver=solver,
+                stepsize_controller=pid(1e-10),
+                max_events=MAX_EVENTS + 8,
+                throw=False,
+            )
+            return sol.y1, sol
+
+        at = (case.plain.y0, case.clocks.period)
+        derivatives, sol = jax.jacfwd(flow, (0, 1), has_aux=True)(*at) if derive else ((None, None), flow(*at)[1])
+        solved = sol.result == nsjax.RESULTS.successful
+        ambiguous = sol.result == nsjax.RESULTS.ambiguous_event
+        events = sol.events
+        found = Solved(events.t, events.switch, events.mode_after, sol.y1, sol.mode1, derivatives[0], solved, ambiguous)
+        return found, derivatives[1]
+
+    return jax.vmap(one)(cases)
+
+
+def fuzz(name: str, number: int, seed: int, direction: int = 1, derive: bool = False) -> tuple:
+    """The cases, their solutions, and those found; how many agree, are told by a status, are too sensitive to compare;
+    and those that are wrong."""
+    (shape, solver), rng = SHAPES[name], np.random.default_rng(seed)
+    cases = [clocked.generate(rng, shape) for _ in range(number)]
+    if direction < 0:  # with static friction there are several
+        cases = [c._replace(plain=c.plain._replace(bound=np.ones_like(c.plain.bound))) for c in cases]
+    truths = [clocked.solve(case, shape, direction, MAX_EVENTS) for case in cases]
+    # What has no solution must be told, and so gets a little longer.
+    ends = [0.1 * direction if t is None else t.t1 + 0.1 * direction * (t.ends != "") for t in truths]
+    cases = [c._replace(plain=c.plain._replace(t1=np.array(e))) for c, e in zip(cases, ends)]
+    batch = jax.tree.map(lambda *xs: np.stack(xs), *cases)
+    found, by_period = jax.tree.map(np.asarray, run(batch, shape, solver, derive))
+    return cases, truths, by_period, *count(truths, found, (name, seed, direction))
+
+
+@pytest.mark.parametrize("name, direction", [("friction", 1), ("friction", -1), ("relay", 1)])
+def test_random_clocks(name, direction):
+    *_, tally, wrong = fuzz(name, 60, 0, direction)
+    assert not wrong
+    assert tally["events"] > 400
+    assert share(tally, "sensitive") <= 0.05
+    assert told_but_ambiguous(tally) == 0 and share(tally, "needlessly told") <= 0.05
