@@ -216,6 +216,11 @@ def _sampled(
     allowed = max(1e-9, 1e4 * eps) * size + 64 * _N * eps * (terms + size)
     error = jnp.maximum(tail, 100 * missed)
     excess = once(_largest(error / jnp.where(allowed > 0, allowed, 1)))
+    # Forcing that jumps, or has a kink, is of a kind that is known before it, and not what was foretold behind it.
+    rate, f1 = scale * (m @ z[-1])[: len(x)], dt * flat(t + dt, x + moves[-1])
+    size = [jnp.max(jnp.abs(v)) for v in (dt * jfu.ravel_pytree(f)[0], f1, rate, eps**0.5 * jnp.max(jnp.abs(m)) * size)]
+    size += [] if force is None else [force * jnp.abs(dt)]
+    fits = fits & lax.stop_gradient(jnp.max(jnp.abs(f1 - rate)) <= 1e-6 * sum(size))
     return [unravel(x + move) for move in moves], unravel(error), excess, fits
 
 

@@ -379,3 +379,32 @@ def test_ticks_while_sticking():
     np.testing.assert_allclose(sol.y1.v, 0.3 * np.cos(24.0), atol=1e-12)
     x = sol.events[0].y_after.x + 0.15 * (np.sin(24.0) - np.sin(2 * start))
     np.testing.assert_allclose(sol.y1.x, x, atol=1e-9)
+
+
+@pytest.mark.parametrize("forcing", ["jump", "kink"])
+def test_field_that_jumps_unannounced(forcing):
+    """Methods that look at their error find a jump of the field, and pay for it; `Exponential`, which does not, refuses
+    it."""
+
+    class Forced(nsjax.System):
+        def vector_field(self, t, y, s):
+            return Motion(y.v, -y.x + (jnp.floor(t / 0.7) if forcing == "jump" else jnp.abs(t % 0.7 - 0.35)))
+
+    for solver in (dfx.Tsit5(), nsjax.Taylor()):
+        sol = nsjax.solve(Forced(), 0.0, 5.0, Motion(0.0, 0.0), solver=solver)
+        edges = np.append(np.arange(0, 5, 0.35), 5.0)
+        y = np.zeros(2)
+        for b, e in zip(edges, edges[1:]):  # x'' = -x + p + q (t - b)
+            p, q = (np.floor((b + e) / 1.4), 0.0) if forcing == "jump" else _triangle(b, e)
+            x, v = y - np.array([p, q])
+            c, s, h = np.cos(e - b), np.sin(e - b), e - b
+            y = np.array([p + q * h + x * c + v * s, q - x * s + v * c])
+        np.testing.assert_allclose(flat(sol.y1), y, atol=2e-5)
+    sol = nsjax.solve(Forced(), 0.0, 5.0, Motion(0.0, 0.0), solver=nsjax.Exponential(), throw=False)
+    assert sol.result == RESULTS.mode_not_affine
+
+
+def _triangle(b, e):
+    middle = (b + e) / 2
+    q = 1.0 if middle % 0.7 > 0.35 else -1.0
+    return abs(middle % 0.7 - 0.35) + q * (b - middle), q
