@@ -79,7 +79,7 @@ def test_closed_forms(walls):
     omega, real = branches.values, ~np.isnan(branches.values)
     np.testing.assert_allclose(branches.periods[real], 2 * np.pi / omega[real], rtol=1e-13)
     amplitude = 1 / np.sqrt((1 - omega**2) ** 2 + (0.1 * omega) ** 2)
-    np.testing.assert_allclose(branches.high.x[real], amplitude[real], rtol=1e-6)
+    np.testing.assert_allclose(branches.high.x[real], amplitude[real], rtol=1e-10)
     product = np.exp(-0.1 * branches.periods)
     np.testing.assert_allclose(np.prod(branches.multipliers, axis=-1)[real], product[real], rtol=1e-10)
     phase = np.arctan2(0.1 * omega, 1 - omega**2)
