@@ -120,8 +120,19 @@ def test_many_random_curved_systems(name):
     print("\n" + ", ".join(f"{key}: {number}" for key, number in tally.items()))
     assert not wrong
     assert share(tally, "sensitive") <= 0.05
-    # Of five switches the first assignment that a search finds is taken, and it may find none.
-    assert told_but_ambiguous(tally) == 0 and share(tally, "needlessly told") <= (0.25 if name == "five" else 0.05)
+    assert told_but_ambiguous(tally) == 0
+    assert name == "five" or share(tally, "needlessly told") <= 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(
+    strict=True,
+    reason="of models with more than four switches the search releases one at a time, and ends in `ambiguous_event` even "
+    "where but two of them are at their surfaces, all of whose assignments could be tried",
+)
+def test_five_switches_are_settled():
+    tally, _ = fuzz("five", 50, 1)
+    assert share(tally, "needlessly told") <= 0.05
 
 
 def sliding_case() -> tuple[Case, Shape, curved.Trajectory]:
