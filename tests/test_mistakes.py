@@ -220,3 +220,10 @@ def test_printed():
     assert str(many.events) == f"event logs of 2 solutions, {low} to {high} events each"
     with pytest.raises(TypeError, match="batch"):
         len(many.events)
+
+
+def test_modes_of_every_kind_of_integer():
+    """What `Solution.mode1` holds, and NumPy's integers, are modes."""
+    for value in (1, np.int32(1), np.int64(1), jnp.asarray(1, jnp.int32)):
+        for mode in ({"belt": value}, [value]):
+            assert run(mode=mode, throw=False).result == nsjax.RESULTS.wrong_mode
