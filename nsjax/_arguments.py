@@ -192,7 +192,8 @@ def _given(system: System, mode: Any) -> dict[str, Any]:
         allowed = (-1, 0, 1) if isinstance(switches[name], sgn) else (0, 1)
         if isinstance(switches[name], clock):
             continue
-        whole = isinstance(value, Tracer) or (eqx.is_array_like(value) and jnp.issubdtype(jnp.result_type(value), jnp.integer))
-        if not whole or (not isinstance(value, Tracer) and jnp.ndim(value) == 0 and int(value) not in allowed):
+        traced = isinstance(value, Tracer)
+        whole = traced or (eqx.is_array_like(value) and jnp.issubdtype(jnp.result_type(value), jnp.integer))
+        if not whole or (not traced and jnp.ndim(value) == 0 and int(value) not in allowed):
             raise ValueError(f"Argument `mode` must give `{name}` one of {allowed}, but got {value!r}.")
     return {n: jnp.asarray(v, jnp.int32) for n, v in mode.items()}
