@@ -37,11 +37,12 @@ from ._cli import (
     UsageError,
 )
 from ._continue_orbit import continue_orbit
+from ._diagnosis import explain
 from ._find_orbit import find_orbit
 from ._orbit import Orbit
 from ._orbit_branch import OrbitBranch
 from ._parameter import get_parameter, parameter_path
-from ._results import is_okay, RESULTS
+from ._results import is_okay, RESULTS, SolveError
 from ._solution import Solution
 from ._solve import solve
 
@@ -96,10 +97,13 @@ def _simulate(args: argparse.Namespace, job: Job, t0: float) -> Solution:
     if t1 is None:
         t1 = t0 + (100.0 if job.system.period is None else 20 * float(job.system.period))
     _note(f"following the solution to t = {t1:g}")
-    return solve(
+    sol = solve(
         job.system, t0, t1, _start(job), mode=_mode(args, job), saveat=dfx.SaveAt(dense=True, t1=True),
         max_steps=20_000, max_events=1024, throw=False, **_controller(args),
     )  # fmt: skip
+    if sol.result == RESULTS.wrong_contact or sol.result == RESULTS.wrong_parameter:  # a mistake in the model
+        raise SolveError(explain(job.system, sol))
+    return sol
 
 
 class _Guess(NamedTuple):
@@ -277,7 +281,7 @@ def _complaint(error: BaseException, args: argparse.Namespace) -> str | None:
     if isinstance(error, UsageError | OSError):
         return f"nsjax: error: {error}"
     inside = raised_inside(error)
-    if inside is None and isinstance(error, TypeError | ValueError) and is_ours(error):
+    if inside is None and isinstance(error, TypeError | ValueError | SolveError) and is_ours(error):
         inside = first_line(error)
     return None if inside is None else f"nsjax: error: {inside}"
 

@@ -152,7 +152,7 @@ class Flow(eqx.Module):
         until a tick is not zero there if a product and a difference are rounded as one.)"""
         length = frozen(step.t_next) - frozen(c.t)
         eps = float(jnp.finfo(length.dtype).eps)
-        far = 4 * eps * jnp.abs(frozen(step.t_next)) / jnp.where(length > 0, length, 1) + 256 * eps
+        far = 4 * eps * jnp.abs(frozen(step.t_next)) / jnp.where(length > 0, length, 1) + 32 * eps
 
         def touches(c: list[Scalar], noise: Scalar) -> Bool[Array, ""]:
             value, slope = self.stepper.end(c)
