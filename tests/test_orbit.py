@@ -1,6 +1,7 @@
 """Periodic orbits against closed forms and 40-digit references, and what the search says when there is none."""
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
