@@ -420,7 +420,7 @@ def test_start_by_mode():
         solve(Glue(), 0.0, 1.0, Motion(1.0, 0.0))
 
 
-class Block(NamedTuple):
+class Place(NamedTuple):
     z: Array
     x: Array
     w: Array
@@ -434,7 +434,7 @@ class Slider(nsjax.System):
     push: float = 1.0
 
     def vector_field(self, t, y, s):
-        return Block(y.w, y.v, -1.0 + s.floor, self.push - self.mu * s.floor * s.slip)
+        return Place(y.w, y.v, -1.0 + s.floor, self.push - self.mu * s.floor * s.slip)
 
     @nsjax.impact
     def floor(self, t, y):
@@ -453,7 +453,7 @@ class Slider(nsjax.System):
 def test_friction_of_an_open_contact(mu):
     """Pitfall 43: in flight there is no friction, so that the sliding velocity passes through zero and does not stick;
     on the floor there is, and the impact takes its share of it."""
-    sol = solve(Slider(mu=mu), 0.0, 3.0, Block(0.5, 0.0, 0.0, -0.5))
+    sol = solve(Slider(mu=mu), 0.0, 3.0, Place(0.5, 0.0, 0.0, -0.5))
     flight, landing = sol.events[0], sol.events[1]
     assert flight.switch == "slip" and flight.mode_after == {"floor": 0, "slip": 1}
     np.testing.assert_allclose([flight.t, flight.y_after.v], [0.5, 0.0], atol=1e-12)
