@@ -28,6 +28,7 @@ FIRST, SHORTEST = 1e-3, 1e-9  # steps, in units of the curve
 UNSEEN = 1e-6  # steps that are not shortened any more for the sake of a branch point
 TURN, TURNED = 0.15, 0.5  # the angles between tangents that are aimed at, and allowed
 NEAR = 1e-5  # zeros that are nearer to each other, in steps, are one
+ON = 1e-11  # an orbit of which a test function is smaller in size is on the corner, on whichever side of it by rounding
 VANISHES = 1e-6  # a test function that is smaller, where another one vanishes
 SAME = 1e-6  # two orbits at one parameter that are nearer are one
 SINGULAR = 1e-3  # the test function of branch points, over its value a step before, where another zero is that of one
@@ -219,16 +220,20 @@ class OrbitTracer:
         None if the step must be shorter for them to be told."""
         scale = float(spot.look.branch[1])
         before, after = (told_by(self.curve, p, scale) for p in (spot, step))
-        changed = []
+        changed, found, lost = [], [], []
         for test, value in before.items():
-            if test not in after or after[test] == 0 or value * after[test] > 0:
+            if test not in after or after[test] == 0:
+                continue
+            if test.kind in CORNERS and abs(value) < ON < -after[test] and not self.virtual:
+                found.append(Zero(0.0, test, spot))
+                continue
+            if value * after[test] > 0:
                 continue
             if self.virtual and test.kind not in ("low", "high"):
                 continue
             if test.kind in (*CORNERS, "low", "high") and after[test] > 0:
                 continue  # it comes from where it could not be: a start on the point itself
             changed.append(test)
-        found, lost = [], []
         for test in changed:
             zero = self.located(spot, step, length, test, scale)
             found += [] if zero is None else [zero]

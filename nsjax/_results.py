@@ -62,7 +62,7 @@ with warnings.catch_warnings():  # of another text for success, which diffrax pr
         )
         wrong_reset = (
             "A reset left the state on the wrong side of its surface (h < 0), or still approaching it (dh/dt < 0). "
-            "Check the signs in the method decorated with `.reset` (or a coefficient of restitution below 0)."
+            "Check the signs in the method decorated with `.reset`."
         )
         wrong_parameter = (
             "A number of a switch is out of its range: a breakaway bound is at least 1, a coefficient of "

@@ -126,7 +126,7 @@ def test_every_lane_has_its_own_result():
         (RESULTS.nonfinite_field, (np.nan, 0.5, 0.0, 1.0, 0.0, 2.0)),
         (RESULTS.repulsive_sliding, (0.0, 0.5, -1.0, 1.0, 0.0, 2.0)),
         (RESULTS.start_penetrates, (1.0, 0.5, 0.0, -1.0, 0.0, 2.0)),
-        (RESULTS.wrong_reset, (1.0, -0.5, 0.0, 1.0, 0.0, 5.0)),
+        (RESULTS.wrong_parameter, (1.0, -0.5, 0.0, 1.0, 0.0, 5.0)),
     ]
 
     @jax.jit
