@@ -1,5 +1,6 @@
 """The laws of the switches at their surfaces: what an assignment of hold and release leads to, if it is valid."""
 
+import functools as ft
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -9,6 +10,9 @@ from ._attraction import attraction, negligible, Pairs, reach
 from ._filippov import Model, State
 from ._linear import nearly
 from ._types import Scalar, Y
+
+
+TRIED = 4  # so many switches at their surfaces are settled by trying every assignment
 
 
 class Look(NamedTuple):
@@ -40,6 +44,11 @@ class Instant(NamedTuple):
     @property
     def came(self) -> dict[int, Int[Array, ""]]:
         return {k: self.state.mode[k] for k in self.at}
+
+    @property
+    def many(self) -> Bool[Array, ""]:
+        """Whether more are at their surfaces than every assignment of can be tried."""
+        return ft.reduce(jnp.add, [at.astype(jnp.int32) for at in self.at.values()]) > TRIED
 
     @property
     def starts(self) -> bool:

@@ -420,7 +420,7 @@ class Curved:
                 raise Sensitive(problem.args[0], now) from None
             except Unsolvable:
                 times, switches, modes = [*times, now], [*switches, k], [*modes, mode]
-                return self.trajectory(now, times, switches, modes, y, mode, growth, gains, "no mode", cut)
+                return Trajectory.of(now, times, switches, modes, here, mode, growth, gains, "no mode", cut)
             known = {(j, 0): 1 for j in at if after[j] != 0}
             if sign and self.case.bound[k] == 1:
                 known[k, 0] = 2
@@ -434,24 +434,8 @@ class Curved:
         if np.max(np.linalg.norm(growth, axis=(1, 2))) > GAIN:
             raise Sensitive("chaos", t1)
         self.exactly += y
-        return self.trajectory(t1, times, switches, modes, y, mode, growth, gains, "", cut)
-
-    def trajectory(
-        self, t1: float, times: list, switches: list, modes: list, y: list, mode: tuple, growth, gains, ends, cut
-    ) -> Trajectory:
-        return Trajectory(
-            t1,
-            np.array(times),
-            np.array(switches, int),
-            np.array(modes, int).reshape(len(times), len(mode)),
-            np.array([x / ONE for x in y]),
-            np.array(mode),
-            growth[0],
-            float(np.sum(np.linalg.norm(growth, axis=(1, 2)))),
-            np.array(gains),
-            ends,
-            cut,
-        )
+        last = [x / ONE for x in y]
+        return Trajectory.of(t1, times, switches, modes, last, mode, growth, gains, "", cut)
 
 
 def solve(case: Case, shape: Shape, max_events: int = 40) -> Trajectory | None:

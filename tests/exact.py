@@ -402,19 +402,8 @@ class Exact:
             for j in (k, *toggled):
                 times, switches, modes = [*times, t], [*switches, j], [*modes, (*mode, *self.counts())]
             gains += [gains[-1]] * len(toggled)
-        return Trajectory(
-            t,
-            np.array(times),
-            np.array(switches, int),
-            np.array(modes, int).reshape(len(times), len(mode) + len(self.counts())),
-            z[:n],
-            np.array([*mode, *self.counts()]),
-            growth[0, :n, :n],
-            float(np.sum(np.linalg.norm(growth[:, :n, :n], axis=(1, 2)))),
-            np.array(gains),
-            ends,
-            cut,
-        )
+        counts = self.counts()
+        return Trajectory.of(t, times, switches, modes, z[:n], (*mode, *counts), growth[:, :n, :n], gains, ends, cut)
 
 
 def solve(case: Case, shape: Shape, max_events: int = 40) -> Trajectory | None:

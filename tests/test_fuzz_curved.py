@@ -16,7 +16,7 @@ from curved import Case, Shape
 from jaxtyping import Array
 from models import pid
 from scipy.integrate import solve_ivp
-from trajectory import count, share, Solved, told_but_ambiguous
+from trajectory import count, share, slopes_agree, Solved, told_but_ambiguous
 
 import nsjax
 
@@ -178,17 +178,7 @@ def test_the_series_of_the_reference():
 @pytest.mark.parametrize("name", ["one", "two", "five"])
 def test_the_reference_against_itself(name):
     """What errors grow by, from saltation matrices, is what its solutions depart from each other by."""
-    shape, rng = SHAPES[name][0], np.random.default_rng(0)
-    compared = 0
-    for _ in range(4):
-        case = curved.generate(rng, shape)
-        truth = curved.solve(case, shape, MAX_EVENTS)
-        if truth is None or truth.ends or truth.gain > 1e3:
-            continue
-        step = 1e-5 * rng.normal(size=shape.n) / truth.gain
-        ends = [curved.solve(case._replace(y0=case.y0 + s * step, t1=truth.t1), shape, MAX_EVENTS) for s in (1, -1)]
-        if all(end is not None and not end.cut and len(end.t) == len(truth.t) for end in ends):
-            slope = (ends[0].y1 - ends[1].y1) / 2
-            np.testing.assert_allclose(slope, truth.jacobian @ step, atol=1e-3 * np.linalg.norm(step), rtol=1e-3)
-            compared += 1
-    assert compared > 1
+    shape = SHAPES[name][0]
+    slopes_agree(
+        functools.partial(curved.generate, shape=shape), lambda case: curved.solve(case, shape, MAX_EVENTS), 4, 2
+    )

@@ -29,6 +29,23 @@ class Trajectory(NamedTuple):
     ends: str  # "" at t1; else "no mode": no assignment of stick and slip satisfies the laws at the last event
     cut: str  # why t1 was moved before an event that is too sensitive
 
+    @classmethod
+    def of(cls, t1, times, switches, modes, y1, mode1, growth, gains, ends, cut):
+        """From lists of what happened; `growth` holds the derivatives from the start and from each event on."""
+        return cls(
+            t1,
+            np.array(times),
+            np.array(switches, int),
+            np.array(modes, int).reshape(len(times), len(mode1)),
+            np.array(y1),
+            np.array(mode1),
+            growth[0],
+            float(np.sum(np.linalg.norm(growth, axis=(1, 2)))),
+            np.array(gains),
+            ends,
+            cut,
+        )
+
 
 class Sensitive(Exception):
     """The solution here depends on digits that a numerical method does not have: why, and at what time."""
@@ -196,3 +213,21 @@ def told_but_ambiguous(tally: collections.Counter) -> int:
     """How many that have a solution were not solved, for another reason than that no mode was found. (With strong
     coupling of switches the search for one may fail, but says so.)"""
     return tally["needlessly told"] - tally["needlessly told ambiguous"]
+
+
+def slopes_agree(generate, solve, number: int, least: int) -> None:
+    """The derivatives of a reference, from saltation matrices, are those of its solutions: of so many cases, at least
+    so many of which can be compared."""
+    rng, compared = np.random.default_rng(0), 0
+    for _ in range(number):
+        case = generate(rng)
+        truth = solve(case)
+        if truth is None or truth.ends or truth.gain > 1e3:
+            continue
+        step = 1e-5 * rng.normal(size=len(case.y0)) / truth.gain
+        ends = [solve(case._replace(y0=case.y0 + s * step, t1=truth.t1)) for s in (1, -1)]
+        if all(end is not None and not end.cut and len(end.t) == len(truth.t) for end in ends):
+            slope = (ends[0].y1 - ends[1].y1) / 2
+            np.testing.assert_allclose(slope, truth.jacobian @ step, atol=1e-3 * np.linalg.norm(step), rtol=1e-3)
+            compared += 1
+    assert compared >= least
