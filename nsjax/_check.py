@@ -69,9 +69,11 @@ def laws(system: System, switch: AbstractSwitch) -> list[tuple[str, str, Any, An
         return [(".restitution", "a number from 0 to 1", (e >= 0) & (e <= 1), e)]
     if isinstance(switch, clock):
         ticks = jnp.asarray(switch.guard(system))
+        start = jnp.asarray(0.0 if switch.offset_fn is None else switch.offset_fn(system))
+        found = [(".offset", "a finite time", jnp.isfinite(start), start)]
         if ticks.ndim == 0:
-            return [("", "a time above zero", ticks > 0, ticks)]
-        return [("", "a vector of increasing times", jnp.all(ticks[1:] > ticks[:-1]), ticks)]
+            return [("", "a time above zero", ticks > 0, ticks), *found]
+        return [("", "a vector of increasing times", jnp.all(ticks[1:] > ticks[:-1]), ticks), *found]
     return []
 
 

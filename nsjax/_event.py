@@ -7,6 +7,7 @@ import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._crossing import at, bend, deflate, falls, first_root, largest
@@ -88,22 +89,24 @@ def locate(
     state: State,
     polynomials: list[Float[Array, "slots parts"]],
     noise: Float[Array, "slots parts"],
-) -> tuple[Bool[Array, ""], Scalar, Y, Int[Array, ""], Int[Array, ""], Scalar]:
-    """The earliest event of a step: its time, the state there, the slot and the part of the guard that fires. If there
-    is none, these of the guard that comes nearest to zero within the step and rises again; and its least value.
+) -> tuple[Bool[Array, ""], Scalar, Y, Int[Array, ""], Int[Array, " slots"], Float[Array, " slots"]]:
+    """The earliest event of a step: whether there is one, its time, the state there, the slot of the guard that fires,
+    and of each guard the part that is active there. Without an event they are those of the guard that comes nearest to
+    zero and rises again. And the least value of each guard that does so before the event, infinite of others.
 
     The root on the dense output is only where to look: the step is taken again to it, and one Newton step with the true
     field corrects the time, and with it the order of events closer than the dense output can tell. The state follows by
     its Taylor series to second order, so that what remains is of third order in the (small) error of the dense output.
     """
     known = model.stacked(model.known_roots(state), 0)
-    # In the same search where each guard is least: one that comes near to zero, and does not meet it, is told.
+    # In the same search where each guard is least: what comes near to zero, and does not meet it, is told.
     single = jnp.asarray([slot.switch not in model.clocks and model.parts[slot.switch] == 1 for slot in model.slots])
     first = jnp.arange(known.shape[1]) == 0
     lows = [jnp.where(first, x, -1.0) for x in falls(polynomials)]
     both = [jnp.concatenate(pair) for pair in zip(deflate(polynomials, known), lows)]
     (found, turns), (root, low) = (jnp.split(x, 2) for x in jax.vmap(first_root)(both))
-    turns = turns & (low > 0) & single & (known[:, 0] == 0)
+    single = single & (known[:, 0] == 0)
+    turns = turns & (low > 0) & single
     args = (model, t, y, f0, state)
     frozen_model, start, y_start, f_start, _ = frozen(args)
 
@@ -121,8 +124,8 @@ def locate(
     earliest = jnp.min(root)
     length = lax.stop_gradient(t_next) - start
     met = jnp.any(found)
-    least = jnp.where(turns, at(polynomials, low)[:, 0] / once(largest(polynomials))[:, 0], jnp.inf)
-    nearest = jnp.argmin(least)
+    dips = jnp.where(turns & (low < earliest), at(polynomials, low)[:, 0], jnp.inf)
+    nearest = jnp.argmin(dips / once(largest(polynomials))[:, 0])
     guess = start + jnp.where(met, jnp.minimum(earliest, 1), jnp.where(turns[nearest], low[nearest], 1)) * length
 
     y_guess = stepper(frozen_model, state, start, guess, y_start, f_start).y1
@@ -141,7 +144,12 @@ def locate(
     blur = jnp.take_along_axis(noise, part[:, None], axis=-1)[:, 0] / jnp.where(rate == 0, 1, jnp.abs(rate))
     latest = jnp.min(jnp.where(found, shift + jnp.where(trusted, blur, 0), jnp.inf))
     slot = jnp.where(met, jnp.argmax(found & (shift <= latest)), nearest).astype(jnp.int32)
-    missed = jnp.where(met | ~turns[nearest], jnp.inf, value[nearest])
+    # The dense output tells how near that comes; without an event the step leads to the nearest of them itself.
+    missed = jnp.where(~met & (jnp.arange(len(dips)) == nearest) & (dips < jnp.inf), value, dips)
+    if model.clocks:  # at a tick a guard may jump away from zero as it comes to it
+        ticks = met & jnp.asarray([k in model.clocks for k, _, _ in model.slots])[slot]
+        falls_on = ticks & single & (value > 0) & (rate < 0)
+        missed = jnp.where(falls_on, jnp.minimum(missed, value), missed)
     te = jnp.clip(guess + shift[slot], start, start + length)
     dt = te - guess
     bend = jax.jvp(flow, (guess, y_guess), (one, f))[1]
@@ -150,7 +158,7 @@ def locate(
     # At the very start of the step the event is a consequence of the one before: it has the same time and derivative.
     at_once = jnp.isfinite(root[slot]) & (root[slot] <= 0)
     te, y_end = jax.tree.map(lambda a, b: jnp.where(at_once, a, b), (t, y), (te, y_end))
-    return met, te, y_end, slot, part[slot], missed
+    return met, te, y_end, slot, part, missed
 
 
 def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> tuple[Y, Y]:
@@ -235,7 +243,8 @@ def land(
     noise: Float[Array, "slots parts"],
 ) -> Landing:
     """Locates the earliest event of a step and makes the transition there."""
-    found, te, before, slot, part, missed = locate(model, stepper, t, t_next, y, f0, state, polynomials, noise)
+    found, te, before, slot, active, missed = locate(model, stepper, t, t_next, y, f0, state, polynomials, noise)
+    part = active[slot]
     ticks = jnp.asarray([k in model.clocks for k, _, _ in model.slots])[slot] if model.clocks else None
     if ticks is not None:  # to the last digit
         te = te + lax.stop_gradient(jnp.where(ticks, model.next_tick(state.mode) - te, 0))
@@ -332,7 +341,7 @@ def land(
             roots[k] = jnp.where(moved, (level > 0).astype(jnp.int32), roots[k])
             at[k] = ends | ((modes[k] == 1) & ~moved)
         else:
-            result = RESULTS.where(ends, RESULTS.accumulation_reached, result)
+            result = RESULTS.where(ends & (result == RESULTS.successful), RESULTS.accumulation_reached, result)
     at = {k: at[k] for k in sorted(at)}
     state_after = State(tuple(m.astype(jnp.int32) for m in modes), tuple(parts), tuple(roots))
     # What cannot be held crosses when it fires, but for the residual of an event a few ulps earlier, which dh/dt tells.
@@ -343,7 +352,7 @@ def land(
     for k in model.holdable:
         entered = model.held(k, state_after.mode[k]) & ~model.held(k, state.mode[k])
         forked = forked | (entered & (model.direction < 0))
-    result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
+    result = RESULTS.where(wrong & (result == RESULTS.successful), RESULTS.ambiguous_event, result)
     if model.contacts:
         after = later.project(t_after, after, state_after)
 
@@ -364,10 +373,18 @@ def land(
         news = news | (state_after.mode[k] != state.mode[k])
         if isinstance(switch, impact):
             news = news | fired[k]
-    cosine, slack = transversality(model, te, before, state, slot, part, tolerance)
-    cosine = cosine if ticks is None else jnp.where(ticks, 1, cosine)
+    cosines, slack = transversality(model, te, before, state, active, tolerance)
+    cosine = cosines[slot]
+    if ticks is not None:
+        cosine = jnp.where(ticks, 1, cosine)
+        # A guard may also jump to just above zero.
+        onto = later.stacked(later.guards(te, after, state_after), jnp.inf)[:, 0]
+        fresh = ticks & (onto > 0) & jnp.asarray([not s.holding and model.parts[s.switch] == 1 for s in model.slots])
+        fresh = fresh & (later.stacked(later.known_roots(state_after), 0)[:, 0] == 0)
+        missed = jnp.where(fresh, jnp.minimum(missed, onto), missed)
     bends = bend([a[slot, part] for a in polynomials], (te - t) / jnp.where(halted, 1, t_next - t)) > 0
     grazes = found & news & ~halted & bends & (cosine < jnp.cbrt(jnp.finfo(te.dtype).eps))
+    cosine = jnp.where(grazes, 0, cosine)  # as it counts from here on
     points = None
     if want_points:
         # Once more, to the very event and with the derivatives of where it begins and ends.
@@ -389,24 +406,25 @@ def land(
         grazes,
         forked,
         result,
-        missed / slack,
+        jnp.min(jnp.where(missed < jnp.inf, missed / slack, jnp.inf)),
     )
 
 
 def transversality(
-    model: Model, t: Scalar, y: Y, state: State, slot: Int[Array, ""], part: Int[Array, ""], tolerance: Any
-) -> tuple[Scalar, Scalar]:
-    """The cosine between the trajectory and the normal of the surface it meets, in time and state; and what an error of
-    the state within the tolerance (relative, absolute) makes of h."""
+    model: Model, t: Scalar, y: Y, state: State, part: Int[Array, " slots"], tolerance: Any
+) -> tuple[Float[Array, " slots"], Float[Array, " slots"]]:
+    """Of each guard the cosine between the trajectory and the normal of its surface, in time and state; and what an
+    error of the state within the tolerance (relative, absolute) makes of it."""
     model, t, y = frozen((model, t, y))
     flat, unravel = jfu.ravel_pytree(y)
 
-    def guard(t: Scalar, x: Array) -> Scalar:
-        return model.stacked(model.guards(t, unravel(x), state), -1.0)[slot, part]
+    def guards(t: Scalar, x: Array) -> Float[Array, " slots"]:
+        return model.stacked(model.guards(t, unravel(x), state), -1.0)[np.arange(len(model.slots)), part]
 
-    h_t, n = jax.grad(guard, argnums=(0, 1))(t, flat)
+    h_t, n = jax.jacfwd(guards, argnums=(0, 1))(t, flat)
     rtol, atol = tolerance
-    return cosine(h_t, n, jfu.ravel_pytree(model.flow(t, y, state))[0]), jnp.abs(n) @ (atol + rtol * jnp.abs(flat))
+    f = jfu.ravel_pytree(model.flow(t, y, state))[0]
+    return jax.vmap(cosine, (0, 0, None))(h_t, n, f), jnp.abs(n) @ (atol + rtol * jnp.abs(flat))
 
 
 def cosine(h_t: Scalar, n: Float[Array, " n"], f: Float[Array, " n"]) -> Scalar:

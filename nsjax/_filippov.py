@@ -153,6 +153,15 @@ class Model(eqx.Module):
         assert isinstance(switch, clock)
         return switch.span(self.system, mode[k], jnp.ones((), jnp.result_type(self.direction)))
 
+    def countable(self, t: Scalar) -> Bool[Array, ""]:
+        """Whether the ticks of all clocks can be told apart and counted up to `t`, in the time of the user."""
+        good = jnp.ones((), bool)
+        for k in self.clocks:
+            switch = self.switches[k]
+            assert isinstance(switch, clock)
+            good = good & switch.countable(self.system, t)
+        return good
+
     def counts(self, t: Scalar) -> dict[int, Int[Array, ""]]:
         """How often each clock has ticked."""
         passed = {}

@@ -148,7 +148,7 @@ def find_orbit(
             "Argument `adjoint` must be `diffrax.ForwardMode()` or `diffrax.DirectAdjoint()`, but got "
             f"{type(adjoint).__name__}."
         )
-    concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, y0, period)))
+    concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, t0, y0, period)))
     if order is None and not autonomous and not concrete:
         raise ValueError("Argument `order` must be given under `jit` and `vmap`: finding it out needs concrete values.")
     newton = dict(tol=tol, max_iterations=max_iterations)

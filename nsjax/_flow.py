@@ -265,7 +265,7 @@ class Flow(eqx.Module):
             grazed, forked = grazed | (event & there.grazes), forked | (moved & there.forked)
             events = events + news.astype(jnp.int32)
             halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(step.keep, 0, halted))
-            result = RESULTS.where(event, there.result, result)
+            result = RESULTS.where(event & (result == RESULTS.successful), there.result, result)
             result = RESULTS.where(halted > 8 + 4 * len(model.switches), RESULTS.stuck_in_events, result)
         accepted = c.accepted + moved.astype(jnp.int32)
 

@@ -36,9 +36,9 @@ NARROWINGS = 16  # of a dip in which parts meet, to a third each
 _SPACING = np.pi / NODES
 _PHI = _SPACING * np.arange(NODES + 1)
 _SERIES = np.linalg.inv(np.cos(np.outer(_PHI, np.arange(NODES + 1))))
-# The coefficients that must vanish: in the middle, so that there are two nodes and more for each half wave and no dip
-# hides between them, and at the end, should the others do so by chance.
-_TAIL = _SERIES[[*range(NODES // 2 - 3, NODES // 2 + 1), *range(NODES - 3, NODES + 1)]]
+# The coefficients that must vanish, so that there are two nodes and more for each half wave and no dip hides between
+# them.
+_TAIL = _SERIES[NODES // 2 - 3 :]
 _BARYCENTRIC = (-1.0) ** np.arange(NODES + 1) * np.where(np.arange(NODES + 1) % NODES == 0, 0.5, 1)
 _LOCAL = np.arange(-5, 6)  # nodes through which a dip is a polynomial
 _TO_POWERS = np.linalg.inv(np.vander(_LOCAL, increasing=True))

@@ -72,6 +72,10 @@ with warnings.catch_warnings():  # of another text for success, which diffrax pr
             "A contact force `s.name` >= 0 must open its gap, but in `vector_field` it closes it. Change its sign "
             "there."
         )
+        clock_too_fast = (
+            "A clock ticks so fast that time has too few digits to tell its ticks apart, or more than 2^30 of them "
+            "have passed. Let time begin nearer to the clock's offset, or take float64."
+        )
         jump_penetrates = (
             "At a tick of a clock an impact surface jumped beyond the state: h < 0 from then on. A gap may open at "
             "once, but cannot close so."

@@ -19,6 +19,7 @@ from ._types import Scalar, Y
 
 
 MORE_PIECES = 16  # in the last try by segments
+MOST_RELAYS = 4  # so many within their hysteresis are tried in all modes; more are off unless told
 
 
 class Search(NamedTuple):
@@ -86,7 +87,7 @@ class Search(NamedTuple):
             return
         given = self.mode or {}
         names = [k for k, open_ in undecided(system, self.t0, y0).items() if open_ and k not in given]
-        for values in itertools.product((0, 1), repeat=len(names)) if names else ():
+        for values in itertools.product((0, 1), repeat=len(names)) if 0 < len(names) <= MOST_RELAYS else ():
             yield given | {name: jnp.asarray(value, jnp.int32) for name, value in zip(names, values)}
 
     def _at_rest(self, system: System, y: Y) -> RESULTS:

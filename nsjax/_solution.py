@@ -7,13 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from ._results import RESULTS
 from ._step import bernstein
 from ._system import System
-from ._text import between, counted, Shown, written
+from ._text import between, counted, known, Shown, written
 from ._types import Scalar, StateT, Y
 
 
@@ -151,7 +150,8 @@ class Solution(Shown, Generic[StateT]):
     - `t0`, `t1`: where it starts and where it ended (before the requested end if it failed or accumulated).
     - `mode0`: the mode in which it sets out.
     - `y1`, `mode1`: the state and the mode at `t1`.
-    - `ts`, `ys`, `modes`: what `saveat` asked for, in order of time, padded with infinities (modes with -128).
+    - `ts`, `ys`, `modes`: what `saveat` asked for, in order of time, padded with infinities (modes with -128, which may
+        also be a clock's: `ts` tells).
     - `events`: the event log.
     - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`, `num_events`.
     - `result`: `RESULTS`; why it ended.
@@ -245,7 +245,7 @@ class Solution(Shown, Generic[StateT]):
         # Times such as 0.1 + 0.2 are off by rounding, which is not meant.
         slack = 4 * float(jnp.finfo(starts.dtype).eps) * (jnp.abs(first) + jnp.abs(last))
         outside = ~((t * direction >= first - slack) & (t * direction <= last + slack))
-        if not isinstance(outside, Tracer) and outside.any():
+        if known((t, outside)) and outside.any():
             wrong = np.ravel(np.asarray(t)[np.asarray(outside)])
             raise ValueError(
                 f"Argument `t` must lie between t0 = {float(self.t0):.10g} and t1 = {float(self.t1):.10g}, but got "

@@ -112,6 +112,8 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     )
     for _, _, good, _ in [law for switch in model.switches for law in laws(system, switch)]:
         result = RESULTS.where(good, result, RESULTS.wrong_parameter)
+    for t in (t0, t1) if model.clocks else ():
+        result = RESULTS.where(model.countable(t), result, RESULTS.clock_too_fast)
     for closes in closing_contacts(model, start, y0).values():
         result = RESULTS.where(closes, RESULTS.wrong_contact, result)
     zero = jnp.zeros((), jnp.int32)

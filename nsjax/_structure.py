@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 
+_CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 # Each entry of the result depends on the same entry of the operands.
 _ELEMENTWISE = frozenset(
     "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy cos cosh "
@@ -19,8 +20,9 @@ _ELEMENTWISE = frozenset(
     "max min mul ne neg nextafter not or pow real_type reduce_precision rem round rsqrt select_n sign sin sinh sqrt "
     "square stop_gradient sub tan tanh xor".split()
 )
-# They jump, or tell others where to. (What only looks whether a number is finite does not count.)
-_JUMPING = frozenset("ceil eq floor ge gt le lt ne nextafter rem round sign".split())
+# They jump. So does what makes integers or truth values of real numbers (comparisons, conversions, `argmax`), and what
+# a loop does is not looked at. (What only asks whether a number is finite does not count.)
+_JUMPING = frozenset("ceil cond floor nextafter rem round scan sign while".split())
 # Entries are moved, repeated or summed: what that makes of a mask (parameters `p` of the primitive, operands `m`).
 _MOVING: dict[str, Callable[..., np.ndarray]] = {
     "broadcast_in_dim": lambda p, m: np.broadcast_to(
@@ -51,7 +53,9 @@ def _masks(jaxpr: Any, inputs: list[np.ndarray], jumps: list[str] | None = None)
 
     for e in jaxpr.eqns:
         have, name = [read(v) for v in e.invars], e.primitive.name
-        if name in _JUMPING and any(m.any() for m in have):
+        real = any(m.any() and jnp.issubdtype(v.aval.dtype, jnp.inexact) for v, m in zip(e.invars, have))
+        whole = any(not jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in e.outvars)
+        if real and (name in _JUMPING or (whole and name not in ("is_finite", *_CALLS))):
             jumps.append(name)
         inner = [p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr)]
         if not any(m.any() for m in have):
@@ -63,7 +67,7 @@ def _masks(jaxpr: Any, inputs: list[np.ndarray], jumps: list[str] | None = None)
         elif name == "dot_general" and not e.params["dimension_numbers"][1][0]:
             left, right = (m.any(tuple(axes)) for m, axes in zip(have, e.params["dimension_numbers"][0]))
             out = [np.logical_or.outer(left, right)]
-        elif name in ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call") and len(inner) == 1:
+        elif name in _CALLS and len(inner) == 1:
             out = _masks(inner[0].jaxpr, have, jumps)
         else:
             out = [np.ones(shape(v), bool) for v in e.outvars]

@@ -16,7 +16,7 @@ from typing import Any, Self, TYPE_CHECKING
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ._text import did_you_mean
 from ._types import Guard, Scalar, Y
@@ -219,6 +219,13 @@ class clock(AbstractSwitch):
             return start + count.astype(like.dtype) * times, start + (count + 1).astype(like.dtype) * times
         ends = jnp.concatenate([jnp.asarray([-jnp.inf], like.dtype), start + times, jnp.asarray([jnp.inf], like.dtype)])
         return ends[count], ends[count + 1]
+
+    def countable(self, system: "System", t: Scalar) -> Bool[Array, ""]:
+        """Whether its ticks can be told apart and counted, up to time `t`."""
+        times, start = self._times(system, t)
+        gap = times if times.ndim == 0 else jnp.min(jnp.diff(times), initial=jnp.inf)
+        digits = gap >= 6400 * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + jnp.abs(start))
+        return digits & (jnp.abs(t - start) < 2.0**30 * (gap if times.ndim == 0 else jnp.inf))
 
     def count(self, system: "System", t: Scalar, forwards: Any) -> Int[Array, ""]:
         """How many ticks have passed at time `t`; at a tick those after it, or before it if time runs backwards."""

@@ -93,8 +93,7 @@ def fundamental_matrix(
 def _beyond_grazing(sol: Solution, t0: Scalar, times: Float[Array, " times"]) -> Bool[Array, " times"]:
     """Which times come after an event so tangential that there are no derivatives by what was before it."""
     sign, events = jnp.where(sol.t1 >= t0, 1, -1), sol.events
-    grazes = events.transversality < jnp.cbrt(jnp.finfo(times.dtype).eps)  # not so in rows without an event
-    first = jnp.min(jnp.where(grazes, events.t * sign, jnp.inf), initial=jnp.inf)
+    first = jnp.min(jnp.where(events.transversality == 0, events.t * sign, jnp.inf), initial=jnp.inf)
     return (sol.result == RESULTS.tangential_event) & ((times * sign > first) | (times == sol.t1))
 
 

@@ -40,6 +40,7 @@ def test_outside(sol):
     assert sol(np.nextafter(40.0, 50.0)) == sol(40.0)
     ys = jax.jit(lambda sol, ts: sol(ts))(sol, jnp.asarray([-1.0, 3.0, 40.0, 41.0, jnp.nan]))
     np.testing.assert_array_equal(np.isnan(ys.x), [True, False, False, True, True])
+    assert np.isnan(jax.jacfwd(lambda t: sol(t).x)(1e3))  # where it is traced
 
 
 def test_derivatives_at_the_ends(sol):
@@ -149,3 +150,26 @@ def test_margin():
     assert run(1e-9).margin < 1 and "tolerances: whether a surface was met" in str(run(1e-9))
     assert run(1.0).margin == np.inf and "tolerances" not in str(run(1.0))
     assert len(run(-1e-3).events) == 4 and run(-1e-3).margin > 100
+
+
+def test_margin_beside_an_event():
+    """Issue 20.8: also where another surface is met in the same step, before or behind."""
+
+    class Two(nsjax.System):
+        at: float = 1.2
+
+        def vector_field(self, t, y, s):
+            return Motion(2 * (y.v - 1) + 0 * s.near, 1.0 + 0 * s.other)
+
+        @nsjax.sgn
+        def near(self, t, y):
+            return y.x
+
+        @nsjax.sgn
+        def other(self, t, y):
+            return y.v - self.at
+
+    run = jax.jit(lambda at: nsjax.solve(Two(at=at), 0.0, 3.0, Motion(1 + 1e-9, 0.0)))
+    for at in (0.9, 1.01, 1.2):
+        sol = run(at)
+        assert len(sol.events) == 1 and 0.02 < sol.margin < 0.2
