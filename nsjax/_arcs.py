@@ -22,7 +22,7 @@ from ._types import Scalar, Y
 
 
 SAMPLES = 65  # of an arc, to be drawn
-TRUSTED = 1e2  # dense output may err by so many tolerances of the steps
+TRUSTED = 1e2  # dense output may err by this many tolerances of the steps
 
 
 class Arcs(NamedTuple):

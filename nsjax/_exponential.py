@@ -216,7 +216,7 @@ def _sampled(
     allowed = max(1e-9, 1e4 * eps) * size + 64 * _N * eps * (terms + size)
     error = jnp.maximum(tail, 100 * missed)
     excess = once(_largest(error / jnp.where(allowed > 0, allowed, 1)))
-    # Forcing that jumps, or has a kink, is of a kind that is known before it, and not what was foretold behind it.
+    # Forcing that jumps, or has a kink, is of a known kind before it, and differs from the prediction after it.
     rate, f1 = scale * (m @ z[-1])[: len(x)], dt * flat(t + dt, x + moves[-1])
     size = [jnp.max(jnp.abs(v)) for v in (dt * jfu.ravel_pytree(f)[0], f1, rate, eps**0.5 * jnp.max(jnp.abs(m)) * size)]
     size += [] if force is None else [force * jnp.abs(dt)]

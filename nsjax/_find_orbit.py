@@ -80,9 +80,9 @@ def find_orbit(
         -y (6.24). Shooting takes half the period then, and finds no orbit that is less symmetric.
     - `backward`: whether to shoot in backward time: for an orbit that leaves a surface which repels (section 6.7), or
         whose multipliers all lie outside the unit circle. What is returned is the orbit as it runs forwards.
-    - `mode`: as for `solve`, for a guess on a surface, or within the hysteresis of a relay (unless told, each of its
-        modes is tried, off first; under `jit` and `vmap` it is off). A state that comes back with the relay in the
-        other mode is no orbit.
+    - `mode`: as for `solve`, for a guess on a surface, or within the hysteresis of a relay. Without it
+        both modes of up to four relays are tried, off first; under `jit` and `vmap` they are off. A state that comes
+        back with the relay in the other mode is no orbit.
     - `method`: "shooting" or "segments"; by default segments if these or `pieces` are given, else shooting, and see
         above.
     - `segments`: the itinerary and its durations, from `y0` on, as a list of `Segment`; the last ends where the first

@@ -147,9 +147,9 @@ class Flow(eqx.Module):
         return _Attempt(step, keep & c.active, dt, halvings, controller, result, busy, touches)
 
     def touches(self, c: Carry, step: Step) -> list[list[Bool[Array, ""]]]:
-        """Which guards fall to zero at the very end of the solution, but for rounding of the time, of the step (whose
-        weights are numbers of some tens), or of their own; and the ticks at which the step ends. (The time that is left
-        until a tick is not zero there if a product and a difference are rounded as one.)"""
+        """Which guards fall to zero at the very end of the solution, apart from rounding of the time, of the step
+        (whose weights are numbers of some tens), or of their own; and the ticks at which the step ends. (The time that
+        is left until a tick is not zero there if a product and a difference are rounded as one.)"""
         length = frozen(step.t_next) - frozen(c.t)
         eps = float(jnp.finfo(length.dtype).eps)
         far = 4 * eps * jnp.abs(frozen(step.t_next)) / jnp.where(length > 0, length, 1) + 32 * eps

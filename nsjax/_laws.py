@@ -12,7 +12,7 @@ from ._linear import nearly
 from ._types import Scalar, Y
 
 
-TRIED = 4  # so many switches at their surfaces are settled by trying every assignment
+TRIED = 4  # up to this many switches at their surfaces, every assignment is tried
 
 
 class Look(NamedTuple):
@@ -47,7 +47,7 @@ class Instant(NamedTuple):
 
     @property
     def many(self) -> Bool[Array, ""]:
-        """Whether more are at their surfaces than every assignment of can be tried."""
+        """Whether too many switches are at their surfaces to try every assignment."""
         return ft.reduce(jnp.add, [at.astype(jnp.int32) for at in self.at.values()]) > TRIED
 
     @property

@@ -33,7 +33,7 @@ def linear_solve(a: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, 
 
 
 def parallel(a: Float[Array, " m"], b: Float[Array, " m"]) -> Bool[Array, ""]:
-    """Whether two rows are multiples of one another but for rounding, whatever the units of rows and columns: all
+    """Whether two rows are multiples of one another apart from rounding, whatever the units of rows and columns: all
     minors a_i b_j - a_j b_i vanish beside their two terms."""
     a, b = lax.stop_gradient((a, b))
     outer = a[:, None] * b[None, :]

@@ -25,7 +25,7 @@ _moments = [0.0 if k % 2 else 1 / (1 - k**2) for k in range(NODES + 1)]
 WEIGHTS = np.linalg.solve(np.polynomial.chebyshev.chebvander(2 * THETA - 1, NODES).T, _moments)
 
 RESOLVED = 1e-9  # of its largest value, or of what is told, the part of a function that its polynomial may miss
-MARGIN = 8.0  # an unresolved function is not lower than its values at the nodes by more than so many of these
+MARGIN = 8.0  # an unresolved function is lower than at its nodes by at most this many times what may be missed
 CALM = 1e-2  # of what may be missed: after a piece that misses less the next is twice as long
 SHORTEST = 2.0**-14  # of the path: a kink is not resolved by any polynomial
 BESIDE = 6e-4  # of the path: nearer to a zero a function divided by it is rounding divided by little

@@ -38,7 +38,7 @@ class Recorder:
         if not self.measures:
             return {}
         n, look = int(spot.course.num), spot.look
-        # Where components of the state are largest and least is no sample's affair.
+        # The largest and the least components are not left to the samples.
         ts = np.concatenate([look.ts[:n], look.turns_t[:n]], axis=1)
         xs = np.concatenate([look.xs[:n], look.turns_x[:n]], axis=1)
         order = np.argsort(ts, axis=1, kind="stable")

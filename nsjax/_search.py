@@ -19,7 +19,7 @@ from ._types import Scalar, Y
 
 
 MORE_PIECES = 16  # in the last try by segments
-MOST_RELAYS = 4  # so many within their hysteresis are tried in all modes; more are off unless told
+MOST_RELAYS = 4  # up to this many within their hysteresis are tried in all modes; more are off unless told
 
 
 class Search(NamedTuple):

@@ -231,7 +231,7 @@ def _either(multiplier: Scalar, bound: Any, slope: Scalar) -> Bool[Array, ""]:
 
 
 def _search(here: Instant, trial: dict, noise: dict) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
-    """The same for so many that not every assignment can be tried."""
+    """The same where too many are at their surfaces to try every assignment."""
     which, came, seen = here.which, here.came, here.look(trial)
     trial = _guess(here, trial, seen)
     # A bound that is reached together with that of another switch is left with it, not in a second event.
@@ -245,7 +245,7 @@ def _search(here: Instant, trial: dict, noise: dict) -> tuple[dict, Look, Bool[A
             trial[k] = jnp.where(tied, came[k], trial[k])
     here = here._replace(leaves=leaves)
 
-    # One release or taking back a round, until nothing is violated; so many rounds do for all to change twice.
+    # One release or taking back a round, until nothing is violated; in all rounds together each can change twice.
     def amend(carry: tuple) -> tuple:
         count, trial, _ = carry
         return count + 1, *_amend(here, trial, here.look(trial), noise)

@@ -264,7 +264,8 @@ class Solution(Shown, Generic[StateT]):
 
         def shaped(y: Array) -> Array:
             y = y.reshape(t.shape + y.shape[1:])
-            return jnp.where(outside.reshape(t.shape + (1,) * (y.ndim - t.ndim)), jnp.nan, y)
+            # A factor makes its derivative NaN too.
+            return y * jnp.where(outside.reshape(t.shape + (1,) * (y.ndim - t.ndim)), jnp.nan, 1)
 
         return jax.tree.map(shaped, ys)
 
