@@ -18,6 +18,7 @@ from ._results import is_okay
 from ._saltation import states
 from ._solve import solve
 from ._system import System
+from ._text import between, shown, written
 from ._types import Scalar, Y
 
 
@@ -25,6 +26,7 @@ SAMPLES = 65  # of an arc, to be drawn
 TRUSTED = 1e2  # dense output may err by this many tolerances of the steps
 
 
+@shown
 class Arcs(NamedTuple):
     """The arcs of an orbit between its events, in rows; those past the last have no length.
 
@@ -41,13 +43,23 @@ class Arcs(NamedTuple):
     mode: Int[Array, "arcs switches"]
     y: Y
 
+    def __str__(self) -> str:
+        real = np.asarray(self.begin != self.end)
+        return f"arcs of an orbit: {real.sum()}, t = {between(np.stack([self.begin, self.end])[:, real])}"
 
+
+@shown
 class Path(NamedTuple):
     """An orbit along its arcs: leaves with two leading axes, for arcs and times."""
 
     t: Float[Array, "arcs times"]
     y: Y
     mode: Int[Array, "arcs switches"]
+
+    def __str__(self) -> str:
+        real = np.asarray(self.t[..., 0] != self.t[..., -1])
+        head = f"path of an orbit, t = {between(self.t)}: arcs {real.sum()}, times on each {self.t.shape[-1]}"
+        return f"{head}\n  states  {written(self.y, self.t.ndim)}"
 
 
 class Smooth(System):

@@ -7,12 +7,14 @@ import jax.flatten_util as jfu
 import numpy as np
 
 from ._pencil import EigenvalueCrossing
+from ._text import listed, shown
 from ._types import Y
 
 
 NOT_BIFURCATIONS = ("none", "hysteresis point", "end")
 
 
+@shown
 class HalfBranch(NamedTuple):
     """A branch on one side of a special point.
 
@@ -37,7 +39,12 @@ class HalfBranch(NamedTuple):
     stable: bool
     index: int
 
+    def __str__(self) -> str:
+        mode = f"mode ({listed(self.mode)}), " if len(self.mode) else ""
+        return f"{half_branch(self.stable, self.side)}: {mode}eigenvalues {listed(self.eigenvalues, 6, 4)}"
 
+
+@shown
 class Bifurcation(NamedTuple):
     """A special point of a branch: a bifurcation, or a place that is none though it looks like one.
 
@@ -123,6 +130,10 @@ class Bifurcation(NamedTuple):
         if self.period is not None:
             lines.append(f"  period     {self.period:.12g}")
         return "\n".join(lines)
+
+
+def half_branch(stable: bool, side: int) -> str:
+    return f"{'stable' if stable else 'unstable'} half-branch {('at the point', 'above', 'below')[side]}"
 
 
 def unstable_number(roots: Any) -> Any:

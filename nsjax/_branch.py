@@ -14,12 +14,14 @@ from ._bifurcation import Bifurcation, HalfBranch, NOT_BIFURCATIONS, unstable_nu
 from ._equilibrium_curve import Record
 from ._pencil import EigenvalueCrossing
 from ._system import System
+from ._text import shown
 from ._types import Y
 
 
 CLOSED = "the start: it is closed"
 
 
+@shown
 class Branch(eqx.Module):
     """A curve of equilibria over a parameter.
 

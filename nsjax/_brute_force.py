@@ -14,12 +14,14 @@ from ._arguments import check_solve
 from ._orbit import ravel
 from ._parameter import parameter_path, put_parameter
 from ._poincare import Iterate, phase_map, PoincareMap, positive, Section, section_map
-from ._results import RESULTS
+from ._results import outcomes, RESULTS
 from ._sweep import sweep
 from ._system import arrays_of, System
+from ._text import between, shown, written
 from ._types import Scalar, Y
 
 
+@shown
 class BruteForce(eqx.Module):
     """A brute-force bifurcation diagram: points of solutions on a section, after a transient.
 
@@ -37,6 +39,16 @@ class BruteForce(eqx.Module):
     ts: Float[Array, "values starts keep"]
     ys: Y
     result: RESULTS
+
+    def __str__(self) -> str:
+        *many, values, starts, keep = self.ts.shape
+        head = f"{np.prod(many)} brute-force diagrams" if many else "brute-force diagram"
+        return (
+            f"{head} over {self.parameter} = {between(self.values)}\n"
+            f"  values {values}, starts {starts}, points kept of each {keep}\n"
+            f"  points  {written(self.ys, self.ts.ndim)}\n"
+            f"  result  {outcomes(self.result)}"
+        )
 
     def periods(self, tol: float = 1e-4) -> np.ndarray:
         """After how many points each solution repeats itself: 0 where it does not within half of those kept, as in

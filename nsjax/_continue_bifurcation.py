@@ -19,9 +19,11 @@ from ._orbit_trace import midpoint, Spot
 from ._parameter import get_parameter, parameter_path
 from ._system import System
 from ._test_function import CORNERS, Test
+from ._text import listed, shown
 from ._types import Y
 
 
+@shown
 class CodimensionTwo(NamedTuple):
     """A point at which a curve of special points meets another one, or turns back.
 
@@ -40,7 +42,11 @@ class CodimensionTwo(NamedTuple):
     t: float
     y: Y
 
+    def __str__(self) -> str:
+        return f"{self.name} at ({listed(self.values, 10)}), period {self.period:.10g}"
 
+
+@shown
 class BifurcationCurve(eqx.Module):
     """A curve of special points of periodic orbits in the plane of two parameters.
 

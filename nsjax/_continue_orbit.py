@@ -27,6 +27,7 @@ from ._parameter import get_parameter, parameter_path
 from ._progress import ProgressLine
 from ._system import System
 from ._test_function import Test
+from ._text import shown
 from ._types import StateT, Y
 
 
@@ -123,6 +124,7 @@ def continue_orbit(
     return growth.branch
 
 
+@shown
 class OrbitGrowth(Generic[StateT]):
     """A continuation that is under way: iterate over it, and look at `branch` at any time.
 

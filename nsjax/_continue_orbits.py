@@ -24,9 +24,11 @@ from ._results import is_okay
 from ._sweep import sweep
 from ._system import arrays_of, System
 from ._test_function import BRANCH, PASSED, Test
+from ._text import shown
 from ._types import Y
 
 
+@shown
 class OrbitBranches(eqx.Module):
     """Branches of periodic orbits over a parameter, a lane each, in rows of `points`; rows past the last of a lane are
     not numbers.

@@ -8,8 +8,10 @@ import numpy as np
 from jaxtyping import ArrayLike, Complex, Float
 
 from ._pencil import EigenvalueCrossing, Pencil
+from ._text import between, shown
 
 
+@shown
 class EigenvalueCurve(NamedTuple):
     """A curve in the square of (q1, q2) on which an eigenvalue is zero, or a pair imaginary: a polyline with exact
     vertices.
@@ -23,7 +25,12 @@ class EigenvalueCurve(NamedTuple):
     q: Float[np.ndarray, "points 2"]
     eigenvalues: Complex[np.ndarray, " points"]
 
+    def __str__(self) -> str:
+        (a, b), (c, d) = self.q[0], self.q[-1]
+        return f"curve, {self.kind}: ({a:.6g}, {b:.6g}) to ({c:.6g}, {d:.6g}), {len(self.q)} points"
 
+
+@shown
 class EigenvalueCurves(NamedTuple):
     """What `eigenvalue_crossings` finds over two surfaces.
 
@@ -40,16 +47,13 @@ class EigenvalueCurves(NamedTuple):
     stays: list[EigenvalueCrossing]
 
     def __str__(self) -> str:
-        def ends(c: EigenvalueCurve) -> str:
-            (a, b), (c1, c2) = c.q[0], c.q[-1]
-            return f"curve, {c.kind}: ({a:.6g}, {b:.6g}) to ({c1:.6g}, {c2:.6g}), {len(c.q)} points"
-
         parts = [("edge", self.edges), ("q1 = q2", self.diagonals[0]), ("q1 + q2 = 1", self.diagonals[1])]
-        lines = [ends(curve) for curve in self.curves] + [f"{name}: {x}" for name, found in parts for x in found]
+        lines = [*map(str, self.curves)] + [f"{name}: {x}" for name, found in parts for x in found]
         lines += [f"eigenvalues stay in an area, along {len(self.stays)} lines"] * bool(self.stays)
         return "\n".join(lines) or "no eigenvalue crosses"
 
 
+@shown
 class EigenvaluePath(NamedTuple):
     """The path of set-valued eigenvalues, for drawing; Figs. 5.2, 5.3, 5.13.
 
@@ -63,6 +67,11 @@ class EigenvaluePath(NamedTuple):
     eigenvalues: Complex[np.ndarray, "points n"]
     crossings: list[EigenvalueCrossing]
     multipliers: bool
+
+    def __str__(self) -> str:
+        name = "multipliers" if self.multipliers else "eigenvalues"
+        head = f"path of {self.eigenvalues.shape[1]} {name}, q = {between(self.q)}: {len(self.q)} points"
+        return "\n".join([head, *(f"  {crossing}" for crossing in self.crossings or ["no crossing"])])
 
 
 def eigenvalue_crossings(

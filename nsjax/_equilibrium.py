@@ -14,13 +14,14 @@ from ._filippov import Model, State
 from ._floquet import eigenvalues
 from ._implicit import find_root
 from ._orbit import ravel
-from ._results import RESULTS
+from ._results import outcomes, RESULTS
 from ._system import frozen, impact, relay, System
-from ._text import Shown
+from ._text import listed, shown
 from ._types import Scalar, StateT, Y
 
 
-class Equilibrium(Shown, Generic[StateT]):
+@shown
+class Equilibrium(eqx.Module, Generic[StateT]):
     """A state that does not change.
 
     **Attributes:**
@@ -68,18 +69,18 @@ class Equilibrium(Shown, Generic[StateT]):
         names = [k.name for k in self.system.switches]
         where = ", ".join(f"{n} {int(m):+d}" for n, m in zip(names, self.mode)) or "no switches"
         values = ", ".join(f"{n} {float(v):.6g}" for n, v in zip(names, self.multipliers)) or "none"
-        state = ", ".join(f"{float(x):.12g}" for x in jfu.ravel_pytree(self.y)[0])
         free = len(self.eigenvalues) - int(self.held)
-        roots = ", ".join(f"{complex(z):.6g}" for z in self.eigenvalues[:free]) or "none"
-        kind = "stable" if self.stable else "unstable"
-        words = [kind] + ["virtual"] * (not self.admissible) + ["not isolated"] * (not self.isolated)
+        words = ["stable" if self.stable else "unstable"] + ["virtual"] * (not self.admissible)
+        kind = ", ".join(words + ["not isolated"] * (not self.isolated)) + " equilibrium"
+        if self.result != RESULTS.successful:
+            kind = f"failed search ({outcomes(self.result)}) for an equilibrium"
         return (
-            f"{', '.join(words)} equilibrium of {type(self.system).__name__}\n"
-            f"  state        y = ({state})\n"
+            f"{kind} of {type(self.system).__name__}\n"
+            f"  state        y = ({listed(jfu.ravel_pytree(self.y)[0], 12)})\n"
             f"  mode         {where}{' (on a surface)' if self.boundary else ''}\n"
             f"  switches     {values}\n"
-            f"  eigenvalues  {roots}\n"
-            f"  residual     {float(self.residual):.1e}\n"
+            f"  eigenvalues  {listed(self.eigenvalues[:free])}\n"
+            f"  residual     {float(self.residual):.1e}"
         )
 
 

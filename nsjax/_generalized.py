@@ -7,15 +7,21 @@ import diffrax as dfx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ._arguments import check_solve
 from ._filippov import Model
 from ._parameter import get_parameter, parameter_path, put_parameter
 from ._system import arrays_of, sgn, System
+from ._text import between, shown
 from ._types import Y
 
 
+LARGE = 4  # rows of a matrix that is not printed in full
+
+
+@shown
 class GeneralizedJacobian(NamedTuple):
     """The vertices of Clarke's generalized Jacobian, whose convex hull it is (4.16).
 
@@ -36,7 +42,10 @@ class GeneralizedJacobian(NamedTuple):
         lines = [f"generalized Jacobian on {where}"]
         for side in itertools.product((0, 1), repeat=len(self.surfaces)):
             named = ", ".join(f"{name} {'> 0' if s else '< 0'}" for name, s in zip(self.surfaces, side))
-            rows = "; ".join(" ".join(f"{float(x):.6g}" for x in row) for row in self.vertices[side])
+            matrix = np.asarray(self.vertices[side])
+            rows = "; ".join(" ".join(f"{x:.6g}" for x in row) for row in matrix)
+            if len(matrix) > LARGE:
+                rows = f"{len(matrix)} rows, entries {between(matrix)}"
             lines.append(f"  {named + ': ' if named else ''}[{rows}]")
         return "\n".join(lines)
 

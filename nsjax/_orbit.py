@@ -13,16 +13,17 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from ._arcs import Arcs, model_of, Path, path_of, SAMPLES
 from ._extremum import largest
 from ._floquet import trivial
-from ._results import is_okay, RESULTS
+from ._results import is_okay, outcomes, RESULTS
 from ._saltation import saltation_matrices, states
 from ._solution import Events, Itinerary, Solution
 from ._solve import solve
 from ._system import System
-from ._text import between, Shown
+from ._text import between, listed, shown
 from ._types import Number, Scalar, StateT, Y
 
 
-class Orbit(Shown, Generic[StateT]):
+@shown
+class Orbit(eqx.Module, Generic[StateT]):
     """A periodic solution.
 
     **Attributes:**
@@ -150,18 +151,19 @@ class Orbit(Shown, Generic[StateT]):
                 f"{good.size} searches for periodic orbits of {type(self.system).__name__}: {good.sum()} found\n"
                 f"  {stable.sum()} stable, {(~stable).sum()} unstable, periods {between(np.asarray(self.period)[good])}"
             )
-        state = ", ".join(f"{x:.12g}" for x in ravel(self.y0))
-        multipliers = ", ".join(f"{complex(m):.6g}" for m in self.multipliers)
+        kind = f"{'stable' if self.stable else 'unstable'} periodic orbit"
+        if not is_okay(self.result):
+            kind = f"failed search ({outcomes(self.result)}) for a periodic orbit"
         text = (
-            f"{'stable' if self.stable else 'unstable'} periodic orbit of {type(self.system).__name__}\n"
+            f"{kind} of {type(self.system).__name__}\n"
             f"  period       {float(self.period):.15g}\n"
-            f"  base point   t = {float(self.t0):.6g}, y = ({state})\n"
+            f"  base point   t = {float(self.t0):.6g}, y = ({listed(ravel(self.y0), 12)})\n"
             f"  itinerary    {self.itinerary}\n"
-            f"  multipliers  {multipliers}\n"
-            f"  residual     {float(self.residual):.1e}\n"
+            f"  multipliers  {listed(self.multipliers)}\n"
+            f"  residual     {float(self.residual):.1e}"
         )
         if not self.admissible:
-            text += f"  leaves its modes by {float(self.violation):.3g} at t = {float(self.violation_t):.6g}\n"
+            text += f"\n  leaves its modes by {float(self.violation):.3g} at t = {float(self.violation_t):.6g}"
         return text
 
 

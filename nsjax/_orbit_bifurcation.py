@@ -1,16 +1,19 @@
 """Special points of branches of periodic orbits."""
 
+import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.flatten_util as jfu
 import numpy as np
 
+from ._bifurcation import half_branch
 from ._cycles import CornerKind
 from ._orbit_curve import OrbitCurve
 from ._orbit_trace import Spot
 from ._pencil import EigenvalueCrossing
 from ._test_function import Test
+from ._text import listed, shown
 from ._types import Y
 
 
@@ -29,6 +32,7 @@ class Origin(NamedTuple):
         return f"Origin({self.test.kind})"
 
 
+@shown
 class OrbitHalf(NamedTuple):
     """A branch on one side of a special point.
 
@@ -47,7 +51,13 @@ class OrbitHalf(NamedTuple):
     stable: bool
     itinerary: str
 
+    def __str__(self) -> str:
+        way = textwrap.shorten(self.itinerary, 60, placeholder=" ...") or "no events"
+        multipliers = listed(self.multipliers, 4, 2)
+        return f"{half_branch(self.stable, self.side)}, period {self.laps}: {way}; multipliers {multipliers}"
 
+
+@shown
 class OrbitBifurcation(NamedTuple):
     """A special point of a branch of periodic orbits.
 
@@ -114,7 +124,7 @@ class OrbitBifurcation(NamedTuple):
             lines.append(f"  surfaces     {', '.join(self.surfaces)}")
         below, above = (" ".join(map(str, side)) or "none" for side in self.count)
         lines.append(f"  evidence     {self.evidence}: periods {below} | {above} ({self.by_count})")
-        before, after = (", ".join(f"{complex(m):.8g}" for m in side) for side in self.multipliers)
+        before, after = (listed(side, 8) for side in self.multipliers)
         lines.append(f"  multipliers  {before} | {after}" if self.discontinuous else f"  multipliers  {before}")
         lines += [f"  crossing     {crossing}" for crossing in self.crossings]
         return "\n".join(lines)

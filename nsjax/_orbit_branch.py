@@ -23,12 +23,14 @@ from ._orbit_trace import midpoint, Spot
 from ._parameter import parameter_path, put_parameter
 from ._pencil import EigenvalueCrossing
 from ._system import System
+from ._text import shown
 from ._types import StateT, Y
 
 
 NOT_BIFURCATIONS = ("none", "end")
 
 
+@shown
 class OrbitBranch(eqx.Module, Generic[StateT]):
     """A curve of periodic orbits over a parameter.
 

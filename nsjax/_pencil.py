@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ._text import shown
+
 
 BEYOND = 0.25  # roots this far outside [0, 1] are known too, so that an end point has a before and an after
 NEARLY_REAL = 1e-3  # a root of multiplicity m comes out as m complex ones, about eps^(1/m) apart
@@ -12,6 +14,7 @@ DOUBT = 1e3 * float(np.finfo(np.float64).eps)  # relative to the entries of the 
 GENERIC = np.array([0.61803399, 0.14142136, -0.11803399, 0.90450850, 1.17320508, 0.38196601])
 
 
+@shown
 class EigenvalueCrossing(NamedTuple):
     """A place at which an eigenvalue meets the imaginary axis, or a multiplier the unit circle.
 

@@ -20,10 +20,11 @@ from jaxtyping import Array, Float, Int
 from ._arguments import check_solve
 from ._check import check_model, check_system
 from ._filippov import Model, State
-from ._results import is_okay, raise_if, RESULTS
+from ._results import is_okay, outcomes, raise_if, RESULTS
 from ._solve import solve
 from ._start import AT_ONCE, start_mode
 from ._system import AbstractSwitch, arrays_of, clock, forwarded, frozen, impact, relay, sgn, SwitchValues, System
+from ._text import between, listed, shown, written
 from ._types import Scalar, Y
 
 
@@ -32,6 +33,7 @@ PERIODS = 100  # of the forcing in which a solution is expected to return
 Section = Callable[[Scalar, Y], Scalar] | str
 
 
+@shown
 class Iterate(NamedTuple):
     """An iterate of a Poincaré map; several have a leading axis.
 
@@ -47,6 +49,14 @@ class Iterate(NamedTuple):
     y: Y
     mode: Int[Array, " switches"]
     result: RESULTS
+
+    def __str__(self) -> str:
+        axes = jnp.ndim(self.t)
+        if axes:
+            head = f"{self.t.size} iterates from t = {between(self.t)}"
+            return f"{head}\n  states  {written(self.y, axes)}\n  result  {outcomes(self.result)}"
+        mode = f"; mode ({listed(self.mode)})" if len(self.mode) else ""
+        return f"iterate at t = {float(self.t):.10g}: {written(self.y)}{mode}; {outcomes(self.result)}"
 
 
 def _section_name(system: System) -> str:

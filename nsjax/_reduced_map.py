@@ -13,12 +13,14 @@ from jaxtyping import Array
 from ._arguments import check_solve
 from ._implicit import find_root
 from ._poincare import phase_map, unless_failed
-from ._results import is_okay, raise_if, RESULTS
+from ._results import is_okay, outcomes, raise_if, RESULTS
 from ._solve import solve
 from ._system import arrays_of, System
+from ._text import between, shown, written
 from ._types import Scalar, Y
 
 
+@shown
 class ReducedIterate(NamedTuple):
     """An iterate of a reduced map.
 
@@ -32,6 +34,12 @@ class ReducedIterate(NamedTuple):
     value: Scalar
     y: Y
     result: RESULTS
+
+    def __str__(self) -> str:
+        axes = jnp.ndim(self.value)
+        head = f"{self.value.size} iterates" if axes else "iterate"
+        end = f"  values  {between(self.value)}\n  from    {written(self.y, axes)}\n  result  {outcomes(self.result)}"
+        return f"{head} of a reduced map\n{end}"
 
 
 def _place(y: Y, component: str) -> int:

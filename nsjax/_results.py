@@ -10,6 +10,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool
 
+from ._text import counted
+
 
 with warnings.catch_warnings():  # of another text for success, which diffrax prints as nothing
     warnings.simplefilter("ignore")
@@ -147,6 +149,13 @@ def _raise_if(args: Any) -> Any:
 def _raise_if_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     ((tree, verdict),), ((moves, _),) = primals, tangents
     return _raise_if((tree, verdict)), _raise_if((moves, verdict)) if jax.tree.leaves(moves) else moves
+
+
+def outcomes(result: RESULTS) -> str:
+    """`60 successful, 4 max_steps_reached`; of one alone its name."""
+    names = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
+    each = [names[int(i)] for i in np.ravel(result._value)]
+    return counted(each) if np.ndim(result._value) else each[0]
 
 
 def is_okay(result: RESULTS) -> Bool[Array, ""]:

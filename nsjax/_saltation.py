@@ -5,13 +5,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.flatten_util as jfu
+import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ._event import completed, rebound
 from ._filippov import Model, State
 from ._solution import Events
-from ._system import arrays_of, clock, impact, relay, System
+from ._system import arrays_of, clock, frozen, impact, relay, System
 from ._types import Scalar, Y
 
 
@@ -99,6 +100,7 @@ class _Jump(NamedTuple):
     drest: Float[Array, " n"]  # of the time that the impacts up to the state of rest take
     rest_t: Scalar
     onto: Float[Array, "n n"]  # the linearised constraints of resting contact
+    blur: tuple[Float[Array, " n"], Float[Array, " n"]]  # what rounding can make of f_before and f_after
 
 
 def _jump(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> _Jump:
@@ -121,17 +123,42 @@ def _jump(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) ->
     if isinstance(model.switches[k], impact):
         rests = (before[k] == 0) & (after[k] == 1)
         onto = jnp.where(rests, jax.jacfwd(lambda x: ravel(_held(model, t + rest, unravel(x), after)))(x), onto)
-    f_after = ravel(model.flow(t, unravel(x), states(model, t, unravel(x), after)))
-    return _Jump(n, h_t, f_before, f_after, dr, r_t, drest, rest_t, onto)
+    later = states(model, t, unravel(x), after)
+    f_after = ravel(model.flow(t, unravel(x), later))
+    still, at, begin, end, drift = frozen((model, t, flat, x, jnp.abs(t * f_before)))
+
+    def blur(x: Array, state: State) -> Array:
+        size = unravel(jnp.abs(x) + drift)  # the time, too, is known to rounding only
+        return still.rounding(lambda t, y: ravel(still.flow(t, y, state)), at, unravel(x), size)
+
+    blurs = blur(begin, state) + _part(f_before), blur(end, later) + _part(f_after)
+    return _Jump(n, h_t, f_before, f_after, dr, r_t, drest, rest_t, onto, blurs)
+
+
+def _part(x: Array) -> Array:
+    """What rounding can make of a sum of terms of this size."""
+    return 8 * jnp.finfo(x.dtype).eps * jnp.abs(x)
+
+
+def _unless_rounding(x: Array, blur: Array) -> Array:
+    """Zero where terms cancel, but for their rounding; the derivative stays, as they need not cancel next to it."""
+    return x - lax.stop_gradient(jnp.where(jnp.abs(x) < blur, x, 0))
 
 
 def _matrix(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Float[Array, "n n"]:
     j = _jump(model, t, y, k, before, after)
     late = 1 + j.drest @ j.f_before + j.rest_t  # how much later the state of rest begins when the impact does
-    turn = jnp.outer(j.f_after * late - j.dr @ j.f_before - j.r_t, j.n)
+    blur = jnp.abs(j.dr) @ j.blur[0] + jnp.abs(late) * j.blur[1] + _part(j.r_t)
+    turn = jnp.outer(_unless_rounding(j.f_after * late - j.dr @ j.f_before - j.r_t, blur), j.n)
     # At a tangency the matrix is infinite, but what does not depend on the time of the event stays as it is.
-    jump = j.dr - jnp.outer(j.f_after, j.drest) + jnp.where(turn == 0, 0, turn / (j.n @ j.f_before + j.h_t))
-    return j.onto @ jump if isinstance(model.switches[k], impact) else jump
+    speed = j.n @ j.f_before + j.h_t
+    none = (turn == 0) & (speed == 0)
+    terms = j.dr, -jnp.outer(j.f_after, j.drest), jnp.where(none, 0, turn / jnp.where(none, 1, speed))
+    size = sum(map(jnp.abs, terms), jnp.zeros_like(turn))
+    jump = _unless_rounding(sum(terms, jnp.zeros_like(turn)), _part(size))
+    if not isinstance(model.switches[k], impact):
+        return jump
+    return _unless_rounding(j.onto @ jump, _part(jnp.abs(j.onto) @ size))
 
 
 def saltation_matrix(

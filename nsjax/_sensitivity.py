@@ -1,5 +1,6 @@
 """Derivatives together with the itinerary to which they belong."""
 
+import textwrap
 from collections.abc import Callable
 from typing import Any
 
@@ -8,10 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
-from ._results import RESULTS
+from ._results import outcomes, RESULTS
 from ._solution import Itinerary, Solution
+from ._text import between, shown, written
 
 
+@shown
 class Sensitivity(eqx.Module):
     """What `sensitivity` returns.
 
@@ -30,6 +33,21 @@ class Sensitivity(eqx.Module):
     itinerary: Itinerary
     defined: Bool[Array, ""]
     result: RESULTS
+
+    def __str__(self) -> str:
+        axes = jnp.ndim(self.defined)
+        count, exist = jnp.size(self.defined), jnp.sum(self.defined)
+        if axes:
+            head, way = f"{count} sensitivities, {exist} of them defined", f"{between(self.itinerary.num)} events each"
+        else:
+            head, way = "sensitivity" + " that is not defined" * (not exist), str(self.itinerary)
+        return (
+            f"{head}\n"
+            f"  value       {written(self.value, axes, 4)}\n"
+            f"  derivative  {written(self.jacobian, axes, 4)}\n"
+            f"  itinerary   {textwrap.shorten(way, 100, placeholder=' ...')}\n"
+            f"  result      {outcomes(self.result)}"
+        )
 
 
 def sensitivity(fn: Callable[[Any], tuple[PyTree, Solution]], x: PyTree, *, reverse: bool = False) -> Sensitivity:

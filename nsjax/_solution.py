@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ._results import RESULTS
+from ._results import outcomes, RESULTS
 from ._step import bernstein
 from ._system import System
-from ._text import between, counted, known, Shown, written
+from ._text import between, known, shown, written
 from ._types import Scalar, StateT, Y
 
 
+@shown
 class Event(NamedTuple, Generic[StateT]):
     """One event of a solution, as `for event in sol.events` yields it."""
 
@@ -27,8 +28,15 @@ class Event(NamedTuple, Generic[StateT]):
     y_after: StateT
     transversality: Any
 
+    def __str__(self) -> str:
+        before, after = self.mode_before, self.mode_after
+        changes = [f"{n} {before[n]:+d} -> {after[n]:+d}" for n in before if before[n] != after[n]] or ["reset"]
+        state = ", ".join(f"{x:.6g}" for x in np.concatenate([np.ravel(l) for l in jax.tree.leaves(self.y_after)]))
+        return f"t = {float(self.t):<18.12g} {self.switch}: {', '.join(changes)}   y = ({state})"
 
-class Events(Shown, Generic[StateT]):
+
+@shown
+class Events(eqx.Module, Generic[StateT]):
     """The event log, in order of time, padded to `max_events` rows (time infinite, switch -1).
 
     **Attributes:**
@@ -85,16 +93,11 @@ class Events(Shown, Generic[StateT]):
     def __str__(self) -> str:
         if jnp.ndim(self.num):
             return f"event logs of {self.num.size} solutions, {between(self.num)} events each"
-        lines = []
-        for e in self:
-            changes = [f"{n} {e.mode_before[n]:+d} -> {e.mode_after[n]:+d}" for n in self.names]
-            changes = [c for n, c in zip(self.names, changes) if e.mode_before[n] != e.mode_after[n]] or ["reset"]
-            state = ", ".join(f"{x:.6g}" for x in np.concatenate([np.ravel(l) for l in jax.tree.leaves(e.y_after)]))
-            lines.append(f"t = {float(e.t):<18.12g} {e.switch}: {', '.join(changes)}   y = ({state})")
-        return "\n".join(lines) or "no events"
+        return "\n".join(map(str, self)) or "no events"
 
 
-class Itinerary(Shown):
+@shown
+class Itinerary(eqx.Module):
     """The modes that a solution passes through, with the switches whose events lead from one to the next.
 
     Iterating yields each mode as a dictionary. (A reset leads from a mode to itself.)
@@ -142,7 +145,8 @@ def _shortened(text: str, most: int = 8) -> str:
     return "\n          ".join(lines)
 
 
-class Solution(Shown, Generic[StateT]):
+@shown
+class Solution(eqx.Module, Generic[StateT]):
     """The solution of a piecewise-smooth system.
 
     **Attributes:**
@@ -194,11 +198,9 @@ class Solution(Shown, Generic[StateT]):
         owner, stats, many = type(self.system).__name__, self.stats, jnp.ndim(self.events.num) > 0
         if many:
             count = self.events.num.size
-            names = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
-            results = counted(names[int(i)] for i in np.ravel(self.result._value))
             return (
                 f"{count} solutions of {owner} from t = {between(self.t0)} to {between(self.t1)}\n"
-                f"  result  {results}\n"
+                f"  result  {outcomes(self.result)}\n"
                 f"  steps   {between(stats['num_steps'])}, events {between(stats['num_events'])}"
                 + f"\n  {np.sum(~np.asarray(self.unique))} not unique"
                 * (not np.all(self.unique))

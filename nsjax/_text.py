@@ -7,7 +7,6 @@ import inspect
 from collections.abc import Callable, Iterable
 from typing import Any, ParamSpec, TypeVar
 
-import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
@@ -17,16 +16,26 @@ from ._types import Y
 
 P = ParamSpec("P")
 R = TypeVar("R")
+T = TypeVar("T")
 
 
-class Shown(eqx.Module):
-    """A result that is shown as it is printed, in a notebook too; while it is being traced by its structure."""
+def shown(cls: type[T]) -> type[T]:
+    """Decorates a result with a `__str__`: as it is printed it is shown, in a list and in a notebook too. What holds no
+    numbers, as while it is traced, is shown by its structure."""
+    printed, structure = cls.__str__, cls.__repr__
 
-    def __repr__(self) -> str:
-        return str(self) if known(self) else super().__repr__()
+    def text(self: T) -> str:
+        try:
+            return printed(self) if known(self) else structure(self)
+        except Exception:  # its leaves are something else: shapes, axes, nothing at all; and no `repr` may fail
+            return structure(self)
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    def markup(self: T) -> str:
+        return f"<pre>{html.escape(text(self))}</pre>"
+
+    for name, method in dict(__str__=text, __repr__=text, _repr_html_=markup).items():
+        setattr(cls, name, method)
+    return cls
 
 
 def known(tree: Any) -> bool:
@@ -34,20 +43,26 @@ def known(tree: Any) -> bool:
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
 
 
-def components(y: Y) -> list[tuple[str, Any]]:
-    """The numbers of a state with their names."""
+def components(y: Y, axes: int = 0) -> list[tuple[str, Any]]:
+    """The numbers of a state with their names; of many states, whose leaves have so many leading axes, arrays."""
     out = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(y):
         name = jax.tree_util.keystr(path, simple=True, separator=".") or "y"
         leaf = np.asarray(leaf)
-        out += [(name + (str(list(i)) if i else ""), leaf[i]) for i in np.ndindex(leaf.shape)]
+        out += [(name + (str(list(i)) if i else ""), leaf[(..., *i)]) for i in np.ndindex(leaf.shape[axes:])]
     return out
 
 
-def written(y: Y, most: int = 8) -> str:
-    """`x = 1.5, v = 0.2`; of a long state the beginning."""
-    parts = [f"{name} = {float(value):.6g}" for name, value in components(y)]
+def written(y: Y, axes: int = 0, most: int = 8) -> str:
+    """`x = 1.5, v = 0.2`; of a long state the beginning; of many, which have leading axes, `x = 1.5 to 2, v = 0.2`."""
+    parts = [f"{name} = {between(x) if axes else format(float(x), '.6g')}" for name, x in components(y, axes)]
     return ", ".join(parts[:most] + ["..."] * (len(parts) > most))
+
+
+def listed(values: Any, digits: int = 6, most: int = 8) -> str:
+    """`1+0j, 0.5+0j`; of many the beginning."""
+    values = np.ravel(values).tolist()
+    return ", ".join([f"{x:.{digits}g}" for x in values[:most]] + ["..."] * (len(values) > most)) or "none"
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:
@@ -59,7 +74,7 @@ def counted(names: Iterable[str]) -> str:
     """`60 stable, 4 unstable`."""
     values, numbers = np.unique(list(names), return_counts=True)
     order = np.argsort(-numbers, kind="stable")
-    return ", ".join(f"{numbers[i]} {values[i]}" for i in order)
+    return ", ".join(f"{numbers[i]} {values[i]}" for i in order) or "none"
 
 
 def between(x: Any) -> str:

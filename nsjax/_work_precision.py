@@ -21,6 +21,7 @@ from ._solution import Solution
 from ._solve import solve
 from ._system import AbstractSwitch, forwarded, sgn, SwitchValues, System
 from ._taylor import Taylor
+from ._text import shown
 from ._types import Scalar, Y
 
 
@@ -62,6 +63,7 @@ class Row(NamedTuple):
     failure: str  # what stopped it, or ""
 
 
+@shown
 class WorkPrecision(NamedTuple):
     """The table made by `work_precision`. Prints as Markdown; `nsjax.plot.work_precision` draws it.
 

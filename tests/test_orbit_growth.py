@@ -300,7 +300,7 @@ def test_progress(duffing, capsys):
     lines = written.strip("\n").split("\r")
     assert lines[0] == "" and 2 <= len(lines) < count
     assert lines[1].startswith("branch 1, 2 points, omega = ") and lines[1].endswith(", 0 special points")
-    assert lines[-1].startswith("branch 2, ") and lines[-1].rstrip() == str(whole)
+    assert lines[-1].startswith("branch 2, ") and lines[-1].rstrip() == str(whole) == repr(whole)
     assert sum(len(part) for part in branch.branches) == pytest.approx(int(lines[-1].split()[2]), abs=1)
 
 

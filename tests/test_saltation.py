@@ -222,3 +222,26 @@ def test_a_tangency_is_infinite_not_floored():
     """Pitfall 10."""
     s = saltation_matrix(gallery.StickSlip(), 0.0, Motion(1.0, 0.2), "belt", -1, 1)  # x' = 0.2, v' = -x + F_slip = 0
     assert not np.isfinite(s).all()
+
+
+def test_what_cancels_is_zero():
+    """Where the field does not jump the matrix is the identity, though rounding has taken the event off its surface. Next
+    to that it may jump: the derivative tells."""
+    trilinear = gallery.Trilinear()
+    leave = jax.jit(lambda t, x, v: saltation_matrix(trilinear, t, Motion(x, v), "lower", [1, -1], [-1, -1]))
+    for v in np.linspace(-0.1, -0.9, 9):
+        off = trilinear.x_c - trilinear.c_f * v / trilinear.k_f
+        for x in (np.nextafter(off, 0), off, np.nextafter(off, 2)):
+            np.testing.assert_array_equal(leave(3.7, x, v), np.eye(2))
+    small = gallery.Trilinear(c_f=1e-12)  # no rounding
+    enter = saltation_matrix(small, 3.7, Motion(1.0, 0.4), "lower", [-1, -1], [1, -1])
+    np.testing.assert_allclose(enter, [[1, 0], [-1e-12, 1]], rtol=1e-3)
+    belt = gallery.StickSlip()  # with F_stick = F_slip (3.43) is the identity
+
+    def slip(bound):
+        end = Motion(bound / belt.k, belt.v_dr)
+        return saltation_matrix(gallery.StickSlip(F_stick=bound), 0.0, end, "belt", 0, -1)
+
+    np.testing.assert_array_equal(slip(belt.F_slip), np.eye(2))
+    slope = -1 / (belt.m * belt.v_dr)
+    np.testing.assert_allclose(jax.jacfwd(slip)(belt.F_slip), [[0, 0], [slope, 0]], atol=1e-12)
