@@ -36,15 +36,15 @@ from ._cli import (
     USAGE,
     UsageError,
 )
-from ._continue_orbit import continue_orbit
-from ._diagnosis import explain
-from ._find_orbit import find_orbit
-from ._orbit import Orbit
-from ._orbit_branch import OrbitBranch
-from ._parameter import get_parameter, parameter_path
-from ._results import is_okay, RESULTS, SolveError
-from ._solution import Solution
-from ._solve import solve
+from .continuation.orbits._branch import OrbitBranch
+from .continuation.orbits._continue_orbit import continue_orbit
+from .flow._diagnosis import explain
+from .flow._results import is_okay, RESULTS, SolveError
+from .flow._solution import Solution
+from .flow._solve import solve
+from .orbits._find_orbit import find_orbit
+from .orbits._orbit import Orbit
+from .system._parameter import get_parameter, parameter_path
 
 
 FAILURE = 1  # exit status of a numerical failure; `USAGE` is that of a mistake

@@ -13,16 +13,16 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 
-from ._check import check_system
-from ._find_orbit import find_orbit
-from ._orbit import Orbit
-from ._regularise import banded, smoothed
-from ._solution import Solution
-from ._solve import solve
-from ._system import AbstractSwitch, forwarded, sgn, SwitchValues, System
-from ._taylor import Taylor
-from ._text import shown
+from ._numerics._text import shown
 from ._types import Scalar, Y
+from .flow._solution import Solution
+from .flow._solve import solve
+from .flow.steppers._taylor import Taylor
+from .orbits._find_orbit import find_orbit
+from .orbits._orbit import Orbit
+from .regularise._regularise import banded, smoothed
+from .system._checks import check_system
+from .system._system import AbstractSwitch, forwarded, sgn, SwitchValues, System
 
 
 class Method(NamedTuple):

@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 
 import nsjax
 from nsjax import RESULTS
-from nsjax._structure import is_affine, may_jump
+from nsjax._numerics._jaxpr import is_affine, may_jump
 
 
 class Charge(NamedTuple):

@@ -11,7 +11,7 @@ from models import Motion
 
 import nsjax
 from nsjax import solve
-from nsjax._filippov import Model
+from nsjax.system._model import Model
 
 
 class Free(nsjax.System):

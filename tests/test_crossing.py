@@ -9,7 +9,17 @@ import pytest
 from models import Roots
 
 import nsjax
-from nsjax._crossing import bend, binomials, deflate, first_root, largest, no_root, nodes, to_bernstein, to_chebyshev
+from nsjax._numerics._bernstein import (
+    bend,
+    binomials,
+    deflate,
+    first_root,
+    largest,
+    no_root,
+    nodes,
+    to_bernstein,
+    to_chebyshev,
+)
 
 
 def evaluate(c, u):

@@ -6,8 +6,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from nsjax._crossings import eigenvalue_crossings, eigenvalue_path
 from nsjax.plot._eigenvalues import eigenvalue_path as draw
+from nsjax.setvalued._eigenvalue_crossings import eigenvalue_crossings, eigenvalue_path
 
 
 EXACT = dict(rtol=0, atol=1e-10)

@@ -7,7 +7,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from nsjax._cycles import corner_kind, CornerMap, find_cycles
+from nsjax.maps._corner_normal_form import corner_kind, CornerMap, find_cycles
 
 
 MOEBIUS = {1: 1, 2: -1, 3: -1, 4: 0, 5: -1, 6: 1, 7: -1, 8: 0}

@@ -12,7 +12,7 @@ from models import flat, itinerary, Motion, Pair, pid, Plane, times, with_change
 
 import nsjax
 from nsjax import Exponential, gallery, RESULTS, solve
-from nsjax._exponential import expm
+from nsjax.flow.steppers._exponential import expm
 
 
 DEFECTIVE = np.array([[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, -1.0]])

@@ -6,7 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from nsjax._floquet import eigenvalues, floquet
+from nsjax.derivatives._floquet import eigenvalues, floquet
 
 
 def exact(factors):

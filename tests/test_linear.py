@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nsjax._linear import linear_solve
+from nsjax._numerics._linalg import linear_solve
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -8,7 +8,7 @@ import pytest
 from models import Motion, pid
 
 import nsjax
-from nsjax._minima import minima, THETA
+from nsjax._numerics._minima import minima, THETA
 
 
 def along(*functions, orders=None, slack=0.0, span=1.0):

@@ -8,8 +8,8 @@ import pytest
 
 import nsjax
 from nsjax import gallery, plot
-from nsjax._orbit_bifurcation import OrbitBifurcation
-from nsjax._orbit_branch import OrbitBranch
+from nsjax.continuation.orbits._bifurcation import OrbitBifurcation
+from nsjax.continuation.orbits._branch import OrbitBranch
 
 
 LABELS = {"omega": "ω [rad/s]", "v_dr": "v [m/s]", "x": "x [m]", "v": "x' [m/s]"}

@@ -10,10 +10,10 @@ from test_plot_branch import branch_of, special_at
 
 import nsjax
 from nsjax import gallery, RESULTS
-from nsjax._arcs import Arcs, Path
-from nsjax._bifurcation import Bifurcation, HalfBranch
 from nsjax._work_precision import Row
+from nsjax.continuation.equilibria._bifurcation import Bifurcation, HalfBranch
 from nsjax.gallery import Motion
+from nsjax.orbits.segments._arcs import Arcs, Path
 
 
 GOOD, BAD = RESULTS.successful, RESULTS.max_events_reached
@@ -30,7 +30,7 @@ def several(*results):
 
 
 def orbit(result=GOOD, multipliers=(1, 0.5)):
-    events = nsjax.Events(
+    events = nsjax.flow.Events(
         t=jnp.array([1.0, jnp.inf]), switch=jnp.array([0, -1]), mode_before=jnp.array([[-1], [0]]),
         mode_after=jnp.zeros((2, 1), int), y_before=Motion(jnp.ones(2), jnp.zeros(2)),
         y_after=Motion(jnp.ones(2), jnp.zeros(2)), transversality=jnp.ones(2), num=jnp.asarray(1), names=("belt",),
@@ -53,14 +53,16 @@ def equilibrium(result=GOOD):
 
 
 def sensitivity(defined):
-    itinerary = nsjax.Itinerary(
+    itinerary = nsjax.flow.Itinerary(
         jnp.array([-1]), jnp.array([0, -1]), jnp.zeros((2, 1), int), jnp.asarray(1), ("belt",)
     )  # fmt: skip
-    return nsjax.Sensitivity(STATE, Motion(jnp.asarray(0.3), jnp.ones(3)), itinerary, jnp.asarray(defined), GOOD)
+    return nsjax.derivatives.Sensitivity(
+        STATE, Motion(jnp.asarray(0.3), jnp.ones(3)), itinerary, jnp.asarray(defined), GOOD
+    )
 
 
-CROSSING = nsjax.EigenvalueCrossing(0.25, 2j, 1, -1, (2, 0), 0.25)
-CURVE = nsjax.EigenvalueCurve("zero", np.array([[0.0, 0.5], [1.0, 0.5]]), np.zeros(2, complex))
+CROSSING = nsjax.setvalued.EigenvalueCrossing(0.25, 2j, 1, -1, (2, 0), 0.25)
+CURVE = nsjax.setvalued.EigenvalueCurve("zero", np.array([[0.0, 0.5], [1.0, 0.5]]), np.zeros(2, complex))
 PATH = Path(jnp.array([[0.0, 1.0], [2.0, 2.0]]), Motion(jnp.eye(2), jnp.eye(2)), jnp.zeros((2, 1), int))
 HALF = HalfBranch(-1, np.array([1, 0]), (STATE, 1.0), np.array([-1 + 0j, np.nan]), 0, True, 1)
 HOPF = Bifurcation(
@@ -75,23 +77,23 @@ BRANCH = nsjax.Branch(
 )  # fmt: skip
 CORNER = special_at("fold", 1.5, (0.8, 0.0), (2.0, 0.1), surfaces=("friction",))
 ORBITS = branch_of(gallery.ForcedFriction(), "omega", [1.0, 1.5], [1.0, 2.0], [(0.5, 0), (0.8, 0)], [CORNER], [1])
-CUSP = nsjax.CodimensionTwo("cusp", np.array([0.3, 1.25]), 6.0, np.ones(2), 0.0, STATE)
-LOCUS = nsjax.BifurcationCurve(
+CUSP = nsjax.continuation.CodimensionTwo("cusp", np.array([0.3, 1.25]), 6.0, np.ones(2), 0.0, STATE)
+LOCUS = nsjax.continuation.BifurcationCurve(
     system=BELT, kind="grazing", surfaces=("belt",), parameters=("a", "b"), values=np.eye(2), periods=np.ones(2),
     multipliers=np.ones((2, 2)), ts=np.ones(2), ys=ROWS, special=(CUSP,), indices=(1,), ends=("a = 0", "a = 1"),
 )  # fmt: skip
-LANES = nsjax.OrbitBranches(
+LANES = nsjax.continuation.OrbitBranches(
     systems=BELT, parameter="mu", values=np.ones((1, 3)), periods=np.ones((1, 3)), ts=np.ones((1, 3)), ys=ROWS,
     orders=np.ones(1, int), low=ROWS, high=ROWS, multipliers=np.ones((1, 3, 2)), stable=np.ones((1, 3), bool),
     kinds=np.array([["", "fold", ""]]), start=np.zeros(1, int), num=np.array([2]), ends=np.array([["lost", "lost"]]),
 )  # fmt: skip
-JACOBIAN = nsjax.GeneralizedJacobian(("left",), jnp.stack([jnp.eye(2), -jnp.eye(2)]), None)
-DIAGRAM = nsjax.BruteForce(
+JACOBIAN = nsjax.setvalued.GeneralizedJacobian(("left",), jnp.stack([jnp.eye(2), -jnp.eye(2)]), None)
+DIAGRAM = nsjax.maps.BruteForce(
     "omega", jnp.linspace(1.0, 2.0, 4), jnp.ones((4, 2, 5)), Motion(*jnp.ones((2, 4, 2, 5))),
     several(*[several(GOOD, BAD)] * 4),
 )  # fmt: skip
-ITERATE = nsjax.Iterate(jnp.asarray(6.25), STATE, jnp.array([-1, 1]), GOOD)
-REDUCED = nsjax.ReducedIterate(jnp.asarray(0.7), STATE, GOOD)
+ITERATE = nsjax.maps.Iterate(jnp.asarray(6.25), STATE, jnp.array([-1, 1]), GOOD)
+REDUCED = nsjax.maps.ReducedIterate(jnp.asarray(0.7), STATE, GOOD)
 TABLE = nsjax.WorkPrecision((Row("Tsit5", 1e-6, 0.1, 1e-7, 2.0, None, ""),), 0.0)
 
 # Result, how many lines at most, and what the text begins with and holds.
@@ -114,7 +116,7 @@ CASES = {
     "a branch of orbits": (ORBITS, 8, "1 branch of periodic orbits of ForcedFriction", "fold bifurcation at omega"),
     "a bifurcation of orbits": (CORNER, 5, "discontinuous fold bifurcation at omega = 1.5", "surfaces     friction"),
     "half of it": (
-        nsjax.OrbitHalf(1, 2, np.array([0.5, 0.1]), False, "belt -1 -> belt +0 " * 20),
+        nsjax.continuation.OrbitHalf(1, 2, np.array([0.5, 0.1]), False, "belt -1 -> belt +0 " * 20),
         1, "unstable half-branch above, period 2: belt -1 -> belt +0", " ...; multipliers 0.5, 0.1",
     ),
     "lanes": (LANES, 3, "1 branches of periodic orbits of StickSlip: 2 points", "1 times: fold"),
@@ -122,15 +124,15 @@ CASES = {
     "a point of codimension two": (CUSP, 1, "cusp at (0.3, 1.25), period 6", ""),
     "a crossing": (CROSSING, 1, "q = 0.25: eigenvalue ±2i, unstable 2 -> 0", ""),
     "a curve of eigenvalues": (CURVE, 1, "curve, zero: (0, 0.5) to (1, 0.5), 2 points", ""),
-    "curves": (nsjax.EigenvalueCurves([CURVE], [CROSSING], ([], []), []), 2, "curve, zero", "edge: q = 0.25"),
-    "no curves": (nsjax.EigenvalueCurves([], [], ([], []), []), 1, "no eigenvalue crosses", ""),
+    "curves": (nsjax.setvalued.EigenvalueCurves([CURVE], [CROSSING], ([], []), []), 2, "curve, zero", "edge: q = 0.25"),
+    "no curves": (nsjax.setvalued.EigenvalueCurves([], [], ([], []), []), 1, "no eigenvalue crosses", ""),
     "a path of eigenvalues": (
-        nsjax.EigenvaluePath(np.linspace(0, 1, 9), np.ones((9, 2), complex), [CROSSING], False),
+        nsjax.setvalued.EigenvaluePath(np.linspace(0, 1, 9), np.ones((9, 2), complex), [CROSSING], False),
         2, "path of 2 eigenvalues, q = 0 to 1: 9 points", "q = 0.25",
     ),
     "a generalized Jacobian": (JACOBIAN, 3, "generalized Jacobian on left", "left < 0: [1 0; 0 1]"),
     "a large one": (
-        nsjax.GeneralizedJacobian((), jnp.eye(50), None), 2, "generalized Jacobian on no surface", "50 rows, entries 0 to 1",
+        nsjax.setvalued.GeneralizedJacobian((), jnp.eye(50), None), 2, "generalized Jacobian on no surface", "50 rows, entries 0 to 1",
     ),
     "a diagram": (DIAGRAM, 4, "brute-force diagram over omega = 1 to 2", "4 max_events_reached, 4 successful"),
     "diagrams": (several(DIAGRAM, DIAGRAM), 4, "2 brute-force diagrams over omega", "values 4, starts 2"),

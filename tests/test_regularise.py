@@ -14,7 +14,7 @@ from models import Bumper, flat, Motion, Pair, pid, Plane, Point, Puck
 
 import nsjax
 from nsjax import banded, gallery, smoothed, solve
-from nsjax._regularise import Banded
+from nsjax.regularise._regularise import Banded
 
 
 STIFF = dfx.Kvaerno5()

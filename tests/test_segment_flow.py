@@ -9,11 +9,11 @@ from models import Motion, pid
 
 import nsjax
 from nsjax import continue_orbit, find_orbit, gallery
-from nsjax._arcs import model_of
-from nsjax._orbit_curve import OrbitCurve
-from nsjax._orbit_start import options
-from nsjax._segment_flow import ALWAYS, exactness, FREE_MODES, NEVER, SegmentFlow
-from nsjax._system import arrays_of
+from nsjax.continuation.orbits._start import options
+from nsjax.orbits.segments._arcs import model_of
+from nsjax.orbits.segments._equations import OrbitCurve
+from nsjax.orbits.segments._segment_flow import ALWAYS, exactness, FREE_MODES, NEVER, SegmentFlow
+from nsjax.system._system import arrays_of
 
 
 Y = Motion(jnp.asarray(0.3), jnp.asarray(-0.4))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nsjax._structure import is_affine, is_constant
+from nsjax._numerics._jaxpr import is_affine, is_constant
 
 
 M = jnp.arange(1.0, 10.0).reshape(3, 3)

@@ -12,7 +12,7 @@ from models import flat, itinerary, Motion, pid, Point, times, with_change
 
 import nsjax
 from nsjax import gallery, RESULTS, solve, Taylor
-from nsjax._series import Series
+from nsjax._numerics._series import Series
 
 
 # A function, the same in mpmath, and where to expand it.

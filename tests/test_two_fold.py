@@ -14,7 +14,7 @@ from models import flat, Motion, pid
 
 import nsjax
 from nsjax import RESULTS, solve
-from nsjax._filippov import Model
+from nsjax.system._model import Model
 
 
 class Plane(NamedTuple):

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from .. import plot
-from .._branch import CLOSED
-from .._orbit_bifurcation import OrbitBifurcation
-from .._orbit_branch import OrbitBranch
+from ..continuation.equilibria._branch import CLOSED
+from ..continuation.orbits._bifurcation import OrbitBifurcation
+from ..continuation.orbits._branch import OrbitBranch
 from ..plot._diagram import write_names
 from ..plot._orbit_branch import amplitude
 from ._job import Job, UsageError

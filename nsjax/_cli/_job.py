@@ -15,8 +15,8 @@ from typing import Any
 import jax.numpy as jnp
 
 from .. import gallery
-from .._system import System
 from .._types import Y
+from ..system._system import System
 
 
 class UsageError(Exception):

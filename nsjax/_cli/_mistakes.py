@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from .._results import RESULTS
+from ..flow._results import RESULTS
 
 
 PACKAGE = pathlib.Path(__file__).resolve().parents[1]

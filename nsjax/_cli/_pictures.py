@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from .. import plot
-from .._orbit import Orbit
-from .._solution import Solution
-from .._variational import fundamental_matrix
+from ..derivatives._variational import fundamental_matrix
+from ..flow._solution import Solution
+from ..orbits._orbit import Orbit
 from ..plot import components
 from ..plot._path import arcs, solved
 from ._job import Job

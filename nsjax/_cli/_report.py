@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._orbit import Orbit
-from .._results import RESULTS
-from .._saltation import saltation_matrices
-from .._solution import Events, Solution
-from .._system import System
 from .._types import Y
 from .._version import __version__
+from ..derivatives._saltation import saltation_matrices
+from ..flow._results import RESULTS
+from ..flow._solution import Events, Solution
+from ..orbits._orbit import Orbit
 from ..plot import components
+from ..system._system import System
 from ._job import Job
 from ._mistakes import advice
 from ._units import Note, notes, ratio

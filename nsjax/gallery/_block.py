@@ -5,8 +5,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._system import sgn, SwitchValues, System
 from .._types import Number, Scalar
+from ..system._system import sgn, SwitchValues, System
 from ._friction import falling
 
 

@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
-from .._system import sgn, SwitchValues, System
 from .._types import Number, Scalar
+from ..system._system import sgn, SwitchValues, System
 
 
 class Line(NamedTuple):

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from .._system import sgn, SwitchValues, System
 from .._types import Number, Scalar
+from ..system._system import sgn, SwitchValues, System
 from ._examples import Line, Plane
 
 

@@ -2,8 +2,8 @@
 
 from jaxtyping import Array, Float
 
-from .._system import sgn, SwitchValues, System
 from .._types import Number, Scalar
+from ..system._system import sgn, SwitchValues, System
 from ._friction import falling
 from ._motion import Motion
 

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._system import impact, sgn, SwitchValues, System
 from .._types import Number, Scalar
+from ..system._system import impact, sgn, SwitchValues, System
 from ._motion import Motion
 
 

@@ -7,8 +7,8 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-from .._system import System
 from .._types import Y
+from ..system._system import System
 from ._block import FallingFrictionBlock, Slip, SmoothBlock, StaticPointBlock
 from ._examples import (
     AttractionSliding,

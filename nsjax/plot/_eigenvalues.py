@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._crossings import EigenvaluePath
+from ..setvalued._eigenvalue_crossings import EigenvaluePath
 from ._style import axes_or_new, axis_label, Labels, legend
 
 

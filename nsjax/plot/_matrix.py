@@ -6,8 +6,8 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from .._floquet import trivial
-from .._solution import Events
+from ..derivatives._floquet import trivial
+from ..flow._solution import Events
 from ._style import axes_or_new, axis_label, Labels, legend
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.optimize import linear_sum_assignment
 
-from .._crossings import eigenvalue_path as path_between
-from .._floquet import trivial
-from .._orbit_bifurcation import OrbitBifurcation
-from .._orbit_branch import NOT_BIFURCATIONS, OrbitBranch
+from ..continuation.orbits._bifurcation import OrbitBifurcation
+from ..continuation.orbits._branch import NOT_BIFURCATIONS, OrbitBranch
+from ..derivatives._floquet import trivial
+from ..setvalued._eigenvalue_crossings import eigenvalue_path as path_between
 from ._diagram import LINE, mark, stretches, UNSTABLE, wording, write_names
 from ._eigenvalues import eigenvalue_path
 from ._path import chosen, components

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._continue_bifurcation import BifurcationCurve, CodimensionTwo
+from ..continuation.bifurcations._continue_bifurcation import BifurcationCurve, CodimensionTwo
 from ._diagram import write_names
 from ._style import axes_or_new, axis_label, Labels, legend as add_legend
 

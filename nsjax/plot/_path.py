@@ -10,9 +10,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from .._orbit import Orbit
-from .._solution import Events, Solution
 from .._types import Y
+from ..flow._solution import Events, Solution
+from ..orbits._orbit import Orbit
 
 
 DENSE = dfx.SaveAt(dense=True)

@@ -7,11 +7,11 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
-from .._orbit import Orbit
-from .._solution import Solution
-from .._structure import is_constant
-from .._system import AbstractSwitch, clock, impact, relay, sgn
+from .._numerics._jaxpr import is_constant
 from .._types import Y
+from ..flow._solution import Solution
+from ..orbits._orbit import Orbit
+from ..system._system import AbstractSwitch, clock, impact, relay, sgn
 from ._path import arcs, chosen, components, solved
 from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_legend, mode_line
 

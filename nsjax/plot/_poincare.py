@@ -6,7 +6,7 @@ from typing import Any, TYPE_CHECKING
 import jax
 import numpy as np
 
-from .._brute_force import BruteForce
+from ..maps._brute_force import BruteForce
 from ._path import chosen, components
 from ._style import axes_or_new, axis_label, JUMP, Labels, legend as add_legend
 

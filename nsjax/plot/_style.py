@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, TYPE_CHECKING
 
-from .._system import clock, impact, relay, System
+from ..system._system import clock, impact, relay, System
 
 
 if TYPE_CHECKING:

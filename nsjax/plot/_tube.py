@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._orbit import Orbit
-from .._variational import fundamental_matrix
+from ..derivatives._variational import fundamental_matrix
+from ..orbits._orbit import Orbit
 from ._path import Arc, arcs, chosen, components
 from ._phase import phase_portrait
 from ._style import axes_or_new, Labels, legend as add_legend, mode_line

@@ -1,0 +1,1 @@
+"""Tools that know nothing of dynamics: derivatives, roots, series, polynomials, matrices, texts."""

@@ -1,0 +1,71 @@
+"""Small matrices: their products, and systems of linear equations."""
+
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._types import Scalar
+
+
+def product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
+    """a b, for small matrices written out: of batches of five rows that takes a sixth of the time of XLA's product."""
+    if a.shape[1] > 8:
+        return a @ b
+    return sum((a[:, i : i + 1] * b[i : i + 1] for i in range(1, a.shape[1])), a[:, :1] * b[:1])
+
+
+def linear_solve(a: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+    """x with a x = b.
+
+    Up to three unknowns by Cramer's rule, which XLA vectorises over the lanes of a batch, where it would call LAPACK
+    for each. (Sweeps with two multipliers take a fourteenth of the time, with three a sixth. Elimination written out
+    takes twice as long to compile and run, and with five is no faster than LAPACK.) Scaling rows or columns is no
+    matter.
+    """
+    m = len(b)
+    if m > 3:
+        rows, columns = _scales(lax.stop_gradient(a))
+        return columns * jnp.linalg.solve(rows[:, None] * a * columns, rows * b)
+    columns = [[a[i, j] for i in range(m)] for j in range(m)]
+    right = [b[i] for i in range(m)]
+    whole = _determinant(columns)
+    return jnp.stack([_determinant([*columns[:j], right, *columns[j + 1 :]]) / whole for j in range(m)])
+
+
+def parallel(a: Float[Array, " m"], b: Float[Array, " m"]) -> Bool[Array, ""]:
+    """Whether two rows are multiples of one another apart from rounding, whatever the units of rows and columns: all
+    minors a_i b_j - a_j b_i vanish beside their two terms."""
+    a, b = lax.stop_gradient((a, b))
+    outer = a[:, None] * b[None, :]
+    size = jnp.abs(outer)
+    return jnp.all(jnp.abs(outer - outer.T) <= nearly(a) * (size + size.T))
+
+
+def nearly(like: Array) -> float:
+    """How closely two numbers must agree to count as equal, of those that are computed from several others."""
+    return max(1e-10, 64 * float(jnp.finfo(like.dtype).eps))
+
+
+def _scales(a: Float[Array, "m m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Powers of two for rows and columns, with which entries that are not zero are of size one on (geometric) average.
+
+    Elimination chooses its pivots among the entries of a column, and so by the units of the rows: with units 24 orders
+    of magnitude apart the error is up to 200 eps cond, and 6 eps cond with these scales (170 with those of the largest
+    entries).
+    """
+    there = (a != 0).astype(a.dtype)
+    size = there * jnp.log2(jnp.where(a == 0, 1, jnp.abs(a)))
+    by_row, by_column = (jnp.maximum(jnp.sum(there, axis), 1) for axis in (1, 0))
+    rows, columns = jnp.zeros_like(a[0]), jnp.zeros_like(a[0])
+    for _ in range(4):
+        rows = -jnp.sum(size + there * columns, 1) / by_row
+        columns = -jnp.sum(size + there * rows[:, None], 0) / by_column
+    return jnp.exp2(jnp.round(rows)), jnp.exp2(jnp.round(columns))
+
+
+def _determinant(columns: list[list[Array]]) -> Scalar:
+    first, *others = columns
+    if not others:
+        return first[0]
+    minors = [_determinant([c[:i] + c[i + 1 :] for c in others]) for i in range(len(first))]
+    return sum((x * m * (-1) ** i for i, (x, m) in enumerate(zip(first[1:], minors[1:]), 1)), first[0] * minors[0])

@@ -1,0 +1,65 @@
+"""Roots of equations with parameters, and their derivatives by the implicit function theorem."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Bool
+
+from ._autodiff import dense_jacobian, frozen
+
+
+def find_root(
+    residual: Callable[[Any, Any], Any],
+    guess: Any,
+    parameters: Any,
+    tol: float,
+    max_iterations: int,
+    *,
+    well_posed: bool | None = None,
+) -> tuple[Any, Bool[Array, ""]]:
+    """A root of `residual(z, parameters)` by optimistix's Newton method, and whether it converged.
+
+    The root's derivatives with respect to the parameters, of every order, are those of the implicit function. They are
+    not numbers where there is no root, or where it is not regular: optimistix's own rule raises an error there, which
+    one bad lane of a batch would do for all. Where roots may not be isolated (`well_posed=False`) the steps are the
+    shortest ones.
+    """
+    found = optx.root_find(
+        lambda z, p: dense_jacobian(residual, z, p),
+        optx.Newton(rtol=tol, atol=tol, linear_solver=lx.AutoLinearSolver(well_posed=well_posed)),
+        frozen(guess),
+        args=frozen(parameters),
+        max_steps=max_iterations,
+        throw=False,
+    )
+    converged = found.result == optx.RESULTS.successful
+    z, unravel = jfu.ravel_pytree(frozen(found.value))
+
+    def flat(z: Array, parameters: Any) -> Array:
+        return jfu.ravel_pytree(residual(unravel(z), parameters))[0]
+
+    return unravel(_implicit(z, eqx.filter_closure_convert(flat, z, parameters), parameters, converged)), converged
+
+
+@eqx.filter_custom_jvp
+def _implicit(z: Array, residual: Callable[..., Array], parameters: Any, regular: Bool[Array, ""]) -> Array:
+    return z
+
+
+@_implicit.def_jvp
+def _implicit_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    z, residual, parameters, regular = primals
+    _, moved, change, _ = tangents
+    z = _implicit(z, residual, parameters, regular)
+    jacobian = jax.jacfwd(lambda z: residual(z, parameters))(z)
+    dr = eqx.filter_jvp(lambda f, p: f(z, p), (residual, parameters), (moved, change))[1]
+    if dr is None:
+        return z, jnp.zeros_like(z)
+    move = lx.linear_solve(lx.MatrixLinearOperator(jacobian), -dr, solver=lx.LU(), throw=False).value
+    return z, jnp.where(regular, move, jnp.nan)

@@ -1,0 +1,107 @@
+"""Numbers and names in messages and on paper."""
+
+import difflib
+import functools
+import html
+import inspect
+from collections.abc import Callable, Iterable
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from .._types import Y
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+T = TypeVar("T")
+
+
+def shown(cls: type[T]) -> type[T]:
+    """Decorates a result with a `__str__`: as it is printed it is shown, in a list and in a notebook too. What holds no
+    numbers, as while it is traced, is shown by its structure."""
+    printed, structure = cls.__str__, cls.__repr__
+
+    def text(self: T) -> str:
+        try:
+            return printed(self) if known(self) else structure(self)
+        except Exception:  # its leaves are something else: shapes, axes, nothing at all; and no `repr` may fail
+            return structure(self)
+
+    def markup(self: T) -> str:
+        return f"<pre>{html.escape(text(self))}</pre>"
+
+    for name, method in dict(__str__=text, __repr__=text, _repr_html_=markup).items():
+        setattr(cls, name, method)
+    return cls
+
+
+def known(tree: Any) -> bool:
+    """Whether all numbers are, as they are not under `jit`, `vmap` or differentiation."""
+    return not any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
+
+
+def components(y: Y, axes: int = 0) -> list[tuple[str, Any]]:
+    """The numbers of a state with their names; of many states, whose leaves have so many leading axes, arrays."""
+    out = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(y):
+        name = jax.tree_util.keystr(path, simple=True, separator=".") or "y"
+        leaf = np.asarray(leaf)
+        out += [(name + (str(list(i)) if i else ""), leaf[(..., *i)]) for i in np.ndindex(leaf.shape[axes:])]
+    return out
+
+
+def written(y: Y, axes: int = 0, most: int = 8) -> str:
+    """`x = 1.5, v = 0.2`; of a long state the beginning; of many, which have leading axes, `x = 1.5 to 2, v = 0.2`."""
+    parts = [f"{name} = {between(x) if axes else format(float(x), '.6g')}" for name, x in components(y, axes)]
+    return ", ".join(parts[:most] + ["..."] * (len(parts) > most))
+
+
+def listed(values: Any, digits: int = 6, most: int = 8) -> str:
+    """`1+0j, 0.5+0j`; of many the beginning."""
+    values = np.ravel(values).tolist()
+    return ", ".join([f"{x:.{digits}g}" for x in values[:most]] + ["..."] * (len(values) > most)) or "none"
+
+
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, list(names), 1, 0.6)
+    return f" Did you mean `{near[0]}`?" if near else ""
+
+
+def counted(names: Iterable[str]) -> str:
+    """`60 stable, 4 unstable`."""
+    values, numbers = np.unique(list(names), return_counts=True)
+    order = np.argsort(-numbers, kind="stable")
+    return ", ".join(f"{numbers[i]} {values[i]}" for i in order) or "none"
+
+
+def between(x: Any) -> str:
+    """`3.2 to 14.5`, of the numbers that are finite."""
+    x = np.asarray(x, float)
+    x = x[np.isfinite(x)]
+    if not x.size:
+        return "none"
+    low, high = f"{x.min():.6g}", f"{x.max():.6g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def suggesting(hints: dict[str, str]) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorates a public function: an argument that it does not have is told with the one that may be meant, or with
+    the hint for it."""
+
+    def decorate(fn: Callable[P, R]) -> Callable[P, R]:
+        names = list(inspect.signature(fn).parameters)
+
+        @functools.wraps(fn)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+            for name in kwargs:
+                if name not in names:
+                    hint = f" {hints[name]}" if name in hints else did_you_mean(name, names)
+                    raise TypeError(f"`{fn.__name__}` has no argument `{name}`.{hint}")
+            return fn(*args, **kwargs)
+
+        return checked
+
+    return decorate

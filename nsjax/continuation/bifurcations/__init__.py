@@ -1,0 +1,1 @@
+"""Curves of special points in the plane of two parameters."""

@@ -1,0 +1,280 @@
+"""Curves of special points of periodic orbits in two parameters."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.flatten_util as jfu
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ..._numerics._text import listed, shown
+from ..._types import Y
+from ...orbits.segments._equations import OrbitCurve
+from ...system._parameter import get_parameter, parameter_path
+from ...system._system import System
+from ..equilibria._branch import CLOSED
+from ..orbits._bifurcation import OrbitBifurcation
+from ..orbits._record import states_of
+from ..orbits._test_functions import CORNERS, Test
+from ..orbits._tracer import midpoint, Spot
+from ..orbits.corners._corner import is_impact
+from ._branch_points import BranchLocus
+from ._surface import CUSP, lifted, Locus, RESONANCES, surfaces_of, touches
+from ._tracer import FAILED, LAST, Met, trace, Trail
+
+
+@shown
+class CodimensionTwo(NamedTuple):
+    """A point at which a curve of special points meets another one, or turns back.
+
+    **Attributes:**
+
+    - `name`: "cusp", "fold-flip", "1:1 resonance", "fold at a corner of floor", ...
+    - `values`: of the two parameters.
+    - `period`, `multipliers`: of the orbit there.
+    - `t`, `y`: a time, and the orbit's state then.
+    """
+
+    name: str
+    values: Float[np.ndarray, "2"]
+    period: float
+    multipliers: np.ndarray
+    t: float
+    y: Y
+
+    def __str__(self) -> str:
+        return f"{self.name} at ({listed(self.values, 10)}), period {self.period:.10g}"
+
+
+@shown
+class BifurcationCurve(eqx.Module):
+    """A curve of special points of periodic orbits in the plane of two parameters.
+
+    **Attributes:**
+
+    - `system`: the model.
+    - `kind`: "fold", "flip", "Neimark-Sacker", "symmetry breaking", "transcritical"; of corners "grazing" (the orbit
+        touches a surface), "tangency" (it comes onto one, or leaves it, tangentially), or "corner" (a segment of it
+        vanishes, or one is about to appear).
+    - `surfaces`: the switches whose surfaces it touches at a corner.
+    - `parameters`: their names.
+    - `values`: shape `(points, 2)`.
+    - `periods`: of the orbits [time].
+    - `multipliers`: shape `(points, n)`; at a corner those of one side, not numbers where they are limits only.
+    - `ts`, `ys`: a time, and the state of each orbit then; leaves with a leading axis.
+    - `special`: its points of codimension two, in their order.
+    - `indices`: at which point of the curve each is.
+    - `ends`: why it begins and ends where it does.
+    """
+
+    system: System
+    kind: str
+    surfaces: tuple[str, ...]
+    parameters: tuple[str, str]
+    values: Float[np.ndarray, "points 2"]
+    periods: Float[np.ndarray, " points"]
+    multipliers: Complex[np.ndarray, "points n"]
+    ts: Float[np.ndarray, " points"]
+    ys: Y
+    special: tuple[CodimensionTwo, ...]
+    indices: tuple[int, ...]
+    ends: tuple[str, str]
+
+    @property
+    def discontinuous(self) -> bool:
+        """Whether its points are corners."""
+        return bool(self.surfaces)
+
+    @property
+    def name(self) -> str:
+        """With the surfaces: "grazing of floor"."""
+        return self.kind + (f" of {', '.join(self.surfaces)}" if self.surfaces else "")
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __str__(self) -> str:
+        low, high = np.min(self.values, axis=0), np.max(self.values, axis=0)
+        where = ", ".join(f"{p} in [{a:.6g}, {b:.6g}]" for p, a, b in zip(self.parameters, low, high))
+        lines = [
+            f"curve of periodic orbits of {type(self.system).__name__}: {self.name}",
+            f"  {where}: {len(self)} points",
+        ]
+        lines.append(f"  from {self.ends[0]} to {self.ends[1]}")
+        for point in self.special:
+            at = ", ".join(f"{p} = {v:.10g}" for p, v in zip(self.parameters, point.values))
+            lines.append(f"  {point.name} at {at}, period {point.period:.10g}")
+        return "\n".join(lines)
+
+
+def continue_bifurcation(
+    special: OrbitBifurcation,
+    parameter: str,
+    interval: tuple[float, float],
+    *,
+    first: tuple[float, float] | None = None,
+    max_step: float = 0.02,
+    max_points: int = 500,
+) -> BifurcationCurve:
+    """Follows a special point of a branch of periodic orbits in a second parameter: the curve on which orbits fold,
+    flip, lose a symmetry, graze a surface, or change their itinerary.
+
+    ```python
+    branch = nsjax.continue_orbit(system, orbit, "omega", (0.5, 2.0))
+    curve = nsjax.continue_bifurcation(branch.bifurcations[0], "k_f", (1.0, 8.0))
+    print(curve)
+    nsjax.plot.parameter_plane(curve)
+    ```
+
+    The orbits of one itinerary over two parameters are a surface, on which the points looked for are the zeros of a
+    test function: where its projection on the plane of the parameters is singular (a fold), a multiplier is -1, two
+    have the product 1, a segment has no length. The curve is followed on the surface, where a cusp is a point like
+    others, and so are turns in either parameter. Along it all other test functions are watched: their zeros are the
+    curve's points of codimension two. It goes on through them, and ends where the itinerary changes, or where there is
+    no bifurcation of its kind beyond.
+
+    **Arguments:**
+
+    - `special`: a special point, from the branches that `continue_orbit` found.
+    - `parameter`: the name of another parameter than that of the branch.
+    - `interval`: of this parameter.
+    - `first`: the interval of the parameter of the branch; by default that of the branch.
+    - `max_step`: the longest step, in units of the state, of the orbit's period, and of the intervals.
+    - `max_points`: in each of the two directions in which the curve is followed.
+
+    **Returns:** a `BifurcationCurve`.
+
+    **Raises:** `ValueError` for an unknown parameter, or that of the branch; for an interval without the point; for a
+    special point that was loaded from a file (the way to it is not stored: find the branch again), that is not known
+    as the zero of an equation ("end"), or that does not lie on a curve.
+    """
+    origin = special.origin
+    if origin is None:
+        raise ValueError(
+            "Argument `special` must come from `continue_orbit` itself, but was loaded from a file, which does not "
+            "hold the equations that were solved: call `continue_orbit` again, for a short interval."
+        )
+    if origin.test.kind == "guard":
+        raise ValueError(
+            f"Argument `special` must be a zero of an equation, but of this {special.name} at {special.parameter} = "
+            f"{special.value:.10g} only the neighbourhood is known."
+        )
+    curve = origin.curve
+    system = curve.model.system
+    path = parameter_path(system, parameter)
+    if path == curve.path:
+        raise ValueError(f"Argument `parameter` must be another one than that of the branch, `{parameter}`.")
+    if first is None:
+        first = float(curve.low), float(curve.low + curve.width)
+    for name, one, value in (
+        ("interval", interval, float(get_parameter(system, path))),
+        ("first", first, special.value),
+    ):
+        if not one[0] < one[1] or not one[0] <= value <= one[1]:
+            raise ValueError(
+                f"Argument `{name}` must be (low, high) and hold {value:.6g}, the value at the special point, but is "
+                f"({one[0]:.6g}, {one[1]:.6g})."
+            )
+    low, high = (np.array([first[i], interval[i]], float) for i in (0, 1))
+    surface, spot, test = lifted(origin, path, low, high)
+    kind_of_locus = BranchLocus if test.kind == "branch" else Locus
+    locus = kind_of_locus(surface, test, float(spot.look.branch[1]))
+    try:
+        place = locus.place(spot)
+        place = locus.place(locus.step(place, 0.0), place.along, place.heading)
+        near = [locus.place(locus.step(place, s), place.along, place.heading) for s in (1e-3, -1e-3)]
+    except FAILED as why:
+        raise ValueError(
+            f"Argument `special` must lie on a curve of such points in {special.parameter} and {parameter}, but beside "
+            f"this {special.name} none was found: {why}."
+        ) from why
+    locus = locus.heard([place, *near])
+    ahead = trace(locus, place, max_step, max_points)
+    back = Trail([place.spot]) if ahead.closed else trace(locus, place.turned, max_step, max_points)
+    names = (special.parameter, parameter)
+    kind, surfaces = _kind(surface, spot, special, test)
+    spots = back.spots[:0:-1] + ahead.spots
+    shift = len(back.spots) - 1
+    met = [(shift - i, m) for i, m in back.met[::-1]] + [(shift + i, m) for i, m in ahead.met]
+    ends = [CLOSED if ahead.closed else _end(surface, t, names) for t in (back, ahead)]
+    known = [(i, m) for i, m in met if m.test.kind not in ("low", "high")]
+    bases = [midpoint(surface, s, s.course.rows) for s in spots]
+    unravel = jfu.ravel_pytree(surface.like)[1]
+    silent = {test.kind for test in locus.silent}
+
+    def multipliers(spot: Spot) -> np.ndarray:
+        rho = np.asarray(spot.multipliers, complex)
+        return np.full_like(rho, np.nan) if "flip" in silent else rho
+
+    def codimension_two(i: int, m: Met) -> CodimensionTwo:
+        t, x, _ = bases[i]
+        return CodimensionTwo(
+            name=_name(surface, kind, m),
+            values=np.array(m.spot.look.parameter),
+            period=float(m.spot.look.period),
+            multipliers=multipliers(m.spot),
+            t=t,
+            y=unravel(x),
+        )
+
+    return BifurcationCurve(
+        system=system,
+        kind=kind,
+        surfaces=surfaces,
+        parameters=names,
+        values=np.stack([np.asarray(s.look.parameter) for s in spots]),
+        periods=np.array([float(s.look.period) for s in spots]),
+        multipliers=np.stack([multipliers(s) for s in spots]),
+        ts=np.array([t for t, _, _ in bases]),
+        ys=states_of(surface.like, np.stack([x for _, x, _ in bases])),
+        special=tuple(codimension_two(i, m) for i, m in known),
+        indices=tuple(i for i, _ in known),
+        ends=(ends[0], ends[1]),
+    )
+
+
+def _kind(curve: OrbitCurve, spot: Spot, special: OrbitBifurcation, test: Test) -> tuple[str, tuple[str, ...]]:
+    if test.kind not in (*CORNERS, "grazing"):
+        return special.kind, ()
+    return _touching(curve, spot, test), special.surfaces or surfaces_of(curve, spot, test)
+
+
+def _touching(curve: OrbitCurve, spot: Spot, test: Test) -> str:
+    """How the orbit meets a surface at a corner."""
+    if test.kind == "rate":
+        return "grazing" if is_impact(curve, spot, test.row) else "tangency"
+    if test.kind == "duration" and touches(spot.course, test.row):
+        return "grazing"
+    return "grazing" if test.kind in ("guard", "grazing") else "corner"
+
+
+def _name(curve: OrbitCurve, kind: str, met: Met) -> str:
+    test = met.test
+    if test.kind in (*CORNERS, "grazing"):
+        touched = ", ".join(surfaces_of(curve, met.spot, test))
+        if kind in ("grazing", "tangency", "corner"):
+            other = _touching(curve, met.spot, test)
+            return f"double {kind}" if other == kind else f"{kind} and {other} of {touched}"
+        return f"{kind} at a {_touching(curve, met.spot, test)} of {touched}"
+    if test == CUSP or test in RESONANCES:
+        return test.kind
+    both = {kind, test.kind}
+    if both == {"fold", "flip"}:
+        return "fold-flip"
+    if test.kind == "Neimark-Sacker" and kind in ("fold", "flip"):
+        pair = np.any(np.abs(np.imag(met.spot.multipliers)) > 1e-3)
+        return f"{kind}-Neimark-Sacker" if pair else {"fold": "1:1 resonance", "flip": "1:2 resonance"}[kind]
+    other = {"branch": "branch point"}.get(test.kind, test.kind)
+    return f"{kind}-{other}"
+
+
+def _end(curve: OrbitCurve, trail: Trail, names: tuple[str, str]) -> str:
+    met = trail.end
+    if met is None:
+        at = ", ".join(f"{n} = {v:.6g}" for n, v in zip(names, trail.spots[-1].look.parameter))
+        return f"{trail.why}, at {at}"
+    if met.test.kind in ("low", "high"):
+        return f"{names[met.test.row]} = {met.spot.look.parameter[met.test.row]:.6g}"
+    if met.test.kind in LAST[:5]:
+        return f"a {_touching(curve, met.spot, met.test)} of {', '.join(surfaces_of(curve, met.spot, met.test))}"
+    return met.test.kind

@@ -1,0 +1,222 @@
+"""Along a curve of special points of periodic orbits in two parameters, to where the orbits are none any more."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from ..._numerics._bracket import bracketed
+from ...orbits.segments._equations import linearised
+from ..orbits._test_functions import BRANCH, CORNERS, Test
+from ..orbits._tracer import FIRST, SHORTEST, Spot, TURN, TURNED
+from ..orbits.corners._grazing import cut_course
+from ._surface import AbstractLocus, cleared, CUSP, DELTA, Locus, Place, RESONANCES, seen_at
+
+
+FAILED = (ArithmeticError, KeyError, np.linalg.LinAlgError)  # where an orbit, or what is asked of it, is not found
+TOGETHER = 1e-3  # zeros that are nearer to each other, in steps, are one
+DEGENERATE = 1e-2  # of the slope of the test function: where it is less, two branches of its zeros cross
+# What vanishes together is told by the first. (At a resonance multipliers also pass 1 or -1.)
+RANK = (*CORNERS, *(test.kind for test in RESONANCES), "cusp", "branch", "fold", "flip", "Neimark-Sacker")
+LAST = (*CORNERS, "grazing", "low", "high", "1:1 resonance", "1:2 resonance")  # where the curve ends
+
+
+class Met(NamedTuple):
+    """What else vanishes at a point of the curve: of codimension two."""
+
+    test: Test
+    others: tuple[Test, ...]
+    spot: Spot
+    s: float = 0.0
+
+
+@dataclasses.dataclass
+class Trail:
+    """Points one after the other, and what is met at some of them; `end` is the last if it ends the curve."""
+
+    spots: list[Spot]
+    met: list[tuple[int, Met]] = dataclasses.field(default_factory=list)
+    end: Met | None = None
+    why: str = ""
+    closed: bool = False
+
+
+def trace(locus: AbstractLocus, place: Place, max_step: float, max_points: int) -> Trail:
+    """Follows the curve from a point in the direction that it has there."""
+    out, begin, length, steps = Trail([place.spot]), place, FIRST, 0
+    while len(out.spots) < max_points:
+        try:
+            after = locus.place(locus.step(place, length), place.along, place.heading)
+            turn = float(np.arccos(np.clip(place.along @ after.along, -1, 1)))
+            if turn > TURNED:
+                raise ArithmeticError("it turns too much")
+            found = _met(locus, place, after, length)
+        except FAILED:
+            length /= 2
+            if length < SHORTEST:
+                out.why = "the last orbit that could be found"
+                return out
+            continue
+        for met in found:
+            # Samples show late that a surface is touched: what lies beyond the exact point is no orbit.
+            while met.test.kind == "grazing" and len(out.spots) > 1 and _beyond(out.spots[-1], met.spot, place):
+                out.spots.pop()
+            out.spots.append(met.spot)
+            out.met.append((len(out.spots) - 1, met))
+            if met.test.kind in LAST:
+                out.end = met
+                return out
+        steps += 1
+        if steps > 3 and _passes(locus, place, begin, length):
+            out.spots.append(begin.spot)
+            out.closed = True
+            return out
+        out.spots.append(after.spot)
+        speed = float(np.max(np.abs(after.along) / np.maximum(1, np.abs(after.spot.look.u))))
+        length = min(max_step / speed, length * float(np.clip(TURN / max(turn, 1e-9), 0.5, 2)))
+        place = after
+    out.why = f"max_points = {max_points}"
+    return out
+
+
+def _beyond(spot: Spot, end: Spot, place: Place) -> bool:
+    """In the parameters: the orbits are cut differently."""
+    return float((spot.look.u[-2:] - end.look.u[-2:]) @ place.along[-2:]) > 0
+
+
+def _passes(locus: AbstractLocus, place: Place, begin: Place, length: float) -> bool:
+    s = float(place.along @ (begin.spot.look.u - place.spot.look.u))
+    if not 0 < s <= length or place.along @ begin.along < 0.5:
+        return False
+    return bool(np.max(np.abs(locus.step(place, s).look.u - begin.spot.look.u)) < 1e-6)
+
+
+def _met(locus: AbstractLocus, place: Place, after: Place, length: float) -> list[Met]:
+    """What vanishes between two points, in its order, up to the end of the curve."""
+    old, new = locus.watched(place), locus.watched(after)
+    found = []
+    for test, value in old.items():
+        if test not in new or new[test] == 0 or value * new[test] > 0:
+            continue
+        if test.kind in (*CORNERS, "low", "high") and new[test] > 0:
+            continue  # it comes from where it could not be: a start on the point itself
+        found.append(_located(locus, place, after, length, test))
+    found = [met for met in found if _told(locus, met)]
+    rank = {kind: i for i, kind in enumerate(RANK)}
+    found.sort(key=lambda met: met.s)
+    out: list[Met] = []
+    while found:
+        near = [met for met in found if met.s - found[0].s <= TOGETHER * length]
+        found = found[len(near) :]
+        first, *others = sorted(near, key=lambda met: rank.get(met.test.kind, 99))
+        out.append(first._replace(others=tuple(met.test for met in others)))
+        if first.test.kind in LAST:
+            break
+    return out
+
+
+def _told(locus: AbstractLocus, met: Met) -> bool:
+    """Two real multipliers with the product 1 bifurcate only where both are 1, or -1."""
+    if met.test.kind != "Neimark-Sacker":
+        return True
+    rho = met.spot.multipliers
+    pair = np.any((np.abs(np.abs(rho) - 1) < 1e-5) & (np.abs(np.imag(rho)) > 1e-6))
+    at = {"fold": 1.0, "branch": 1.0, "flip": -1.0}.get(locus.test.kind)
+    double = at is not None and np.sum(np.abs(rho - at) < 1e-3) >= 2 + (locus.curve.autonomous and at == 1)
+    return bool(pair or double)
+
+
+def _located(locus: AbstractLocus, place: Place, after: Place, length: float, test: Test) -> Met:
+    seen: dict[float, Spot] = {0.0: place.spot, length: after.spot}
+
+    def step(s: float) -> Spot:
+        return locus.step(place, s)
+
+    def value(spot: Spot) -> float:
+        here = locus.place(spot, place.along, place.heading) if test == CUSP else dataclasses.replace(place, spot=spot)
+        return locus.watched(here)[test]
+
+    s, regular = length / 2, test != BRANCH
+    try:
+        if regular:
+            rough = test.kind == "guard"  # the least of samples
+            s = bracketed(seen, step, value, 1e-5 * length if rough else 1e-14)
+            # Where the zeros of the test function cross others of its own, as at a corner at which the orbits turn
+            # round with it, points of the curve are known less and less well.
+            regular = locus.place(seen[s], place.along).slope > DEGENERATE * place.slope
+    except FAILED:
+        regular = False
+    if not regular:
+        near = min(seen, key=lambda t: abs(t - s))
+        return _interpolated(locus, place, max(near, 0.1 * length), length, test, value)
+    spot = seen[s]
+    if test.kind == "guard" and isinstance(locus, Locus):
+        exact = _cut(locus, spot, test)
+        if exact is not None:
+            return Met(Test("grazing", test.row, test.slot), (), exact, s)
+    return Met(test, (), spot, s)
+
+
+def _interpolated(
+    locus: AbstractLocus, place: Place, s: float, length: float, test: Test, value: Callable[[Spot], float]
+) -> Met:
+    """A point at which the equations are singular, by polynomials through points of the curve on both sides of it."""
+    shares, values, spots = [], [], []
+    for share in (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0):
+        try:
+            here = locus.step(place, s + 0.5 * length * share)
+            values.append(value(here))
+        except FAILED:
+            continue
+        shares.append(share)
+        spots.append(here)
+    if len(shares) < 5:
+        raise ArithmeticError("too few points beside a singular one")
+    powers = np.vander(shares, increasing=True)
+    roots = np.polynomial.Polynomial(np.linalg.solve(powers, values)).roots()
+    real = [r.real for r in roots if abs(r.imag) < 1e-6 and abs(r) < 1]
+    if not real:
+        raise ArithmeticError("nothing vanishes there")
+    root = min(real, key=abs)
+    weights = np.linalg.solve(powers.T, root ** np.arange(len(shares)))
+    u = weights @ np.stack([here.look.u for here in spots])
+    spot = seen_at(locus.curve, place.spot.course, u, place.spot.look.tangent)
+    # So are the multipliers there a limit, of saltation matrices that are none.
+    monodromy = np.tensordot(weights, np.stack([here.monodromy for here in spots]), axes=1)
+    rho = np.linalg.eigvals(monodromy)
+    rho = rho[np.argsort(-np.abs(rho))].astype(complex)
+    spot = dataclasses.replace(spot, monodromy=monodromy, multipliers=rho)
+    return Met(test, (), spot, s + 0.5 * length * root)
+
+
+def _cut(locus: Locus, spot: Spot, test: Test) -> Spot | None:
+    """The point of the curve at which the least value of a guard is zero exactly: the orbit cut there."""
+    start, rows = cut_course(locus.curve, cleared(locus.curve, spot), [(test.row, test.slot)])
+    row = rows[test.row, test.slot]
+    own = locus.test
+    if own.kind in (*CORNERS, "grazing") and row <= own.row:
+        own = own._replace(row=own.row + 1)
+    u = locus.curve.pack(start, spot.look.parameter)
+    border = np.linalg.svd(np.asarray(linearised(locus.curve, start.course, u)))[2][-2:]
+    try:
+        first, second = (dataclasses.replace(locus, test=t) for t in (own, Test("grazing", row)))
+        rough = seen_at(locus.curve, start.course, u, border)
+        return meet(first, second, first.at(rough, np.zeros(2)))
+    except FAILED:
+        return None
+
+
+def meet(first: Locus, second: Locus, spot: Spot) -> Spot:
+    """Where two test functions vanish, by Newton's method on the surface."""
+    for _ in range(12):
+        here = np.array([first.value(spot), second.value(spot)])
+        sides = [[first.at(spot, sign * DELTA * e) for sign in (1, -1)] for e in np.eye(2)]
+        slopes = [[(f.value(a) - f.value(b)) / (2 * DELTA) for a, b in sides] for f in (first, second)]
+        move = np.linalg.solve(np.array(slopes), -here)
+        if not np.linalg.norm(move) < 0.3:
+            break
+        spot = first.at(spot, move)
+        if np.linalg.norm(move) < 1e-10:
+            return spot
+    raise ArithmeticError("the curves do not meet there")

@@ -1,0 +1,157 @@
+"""Branches of equilibria."""
+
+import dataclasses
+import os
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+from ..._numerics._text import shown
+from ..._types import Y
+from ...setvalued._pencil import EigenvalueCrossing
+from ...system._system import System
+from .._archive import Archive, save, table
+from ._bifurcation import Bifurcation, HalfBranch, NOT_BIFURCATIONS, unstable_number
+from ._equations import Record
+
+
+CLOSED = "the start: it is closed"
+
+
+@shown
+class Branch(eqx.Module):
+    """A curve of equilibria over a parameter.
+
+    **Attributes:**
+
+    - `system`, `parameter`: the model, and the name of the parameter.
+    - `values`: of the parameter, at each point.
+    - `ys`: the states, leaves with a leading axis.
+    - `modes`, `multipliers`: of the switches; shape `(points, switches)`.
+    - `eigenvalues`: shape `(points, n)`; not numbers for the directions that surfaces take.
+    - `unstable`: how many eigenvalues have positive real parts.
+    - `stable`: whether all have negative ones, and surfaces that hold the point attract.
+    - `special`: the special points on it, in their order: bifurcations, and what looks like one.
+    - `indices`: at which point of the branch each is. A corner is there twice, with the eigenvalues of both sides.
+    - `ends`: why it begins and ends where it does.
+    - `others`: the other branches that were found at bifurcations, on the one that `continue_equilibrium` returns.
+    """
+
+    system: System
+    parameter: str
+    values: Float[np.ndarray, " points"]
+    ys: Y
+    modes: Int[np.ndarray, "points switches"]
+    multipliers: Float[np.ndarray, "points switches"]
+    eigenvalues: Complex[np.ndarray, "points n"]
+    unstable: Int[np.ndarray, " points"]
+    stable: Bool[np.ndarray, " points"]
+    special: tuple[Bifurcation, ...]
+    indices: tuple[int, ...]
+    ends: tuple[str, str]
+    others: "tuple[Branch, ...]" = ()
+
+    @property
+    def branches(self) -> "tuple[Branch, ...]":
+        """This one and the others."""
+        return (self, *self.others)
+
+    @property
+    def bifurcations(self) -> tuple[Bifurcation, ...]:
+        """Those of all branches, each once, in the order of the parameter."""
+        found: dict[int, Bifurcation] = {}
+        for branch in self.branches:
+            found |= {id(b): b for b in branch.special if b.kind not in NOT_BIFURCATIONS}
+        return tuple(sorted(found.values(), key=lambda b: b.value))
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes the branch and the others to a file, an `.npz` of plain arrays with a description in JSON."""
+        save(path, "Branch", TYPES, self.system, jax.tree.map(lambda x: x[0], self.ys), {"branch": self})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike, system: System, y: Y | None = None) -> "Branch":
+        """Reads what `save` wrote; arguments and errors as for `OrbitBranch.load`."""
+        return Archive(path, "Branch", TYPES, system, y).part("branch")
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __str__(self) -> str:
+        lines = [f"{len(self.branches)} {'branches' if self.others else 'branch'} of {type(self.system).__name__}"]
+        seen: list[Any] = []
+        for branch in self.branches:
+            low, high = float(np.min(branch.values)), float(np.max(branch.values))
+            lines.append(f"  {self.parameter} in [{low:.6g}, {high:.6g}]: {len(branch)} points, {_stability(branch)}")
+            lines.append(f"    from {branch.ends[0]} to {branch.ends[1]}")
+            for special in branch.special:
+                known = any(special is other for other in seen)
+                lines += [f"    {line}" for line in str(special).splitlines()[: 1 if known else None]]
+                seen.append(special)
+        return "\n".join(lines)
+
+
+def _stability(branch: Branch) -> str:
+    """ "stable, then unstable": runs along the branch."""
+    words = ["stable" if s else "unstable" for s in branch.stable]
+    runs = [word for i, word in enumerate(words) if i == 0 or words[i - 1] != word]
+    return ", then ".join(runs) if len(runs) <= 6 else f"{len(runs)} changes of stability"
+
+
+TYPES = table(Branch, Bifurcation, HalfBranch, EigenvalueCrossing)
+
+
+@dataclasses.dataclass
+class Strand:
+    """Points one after the other, and the special ones among them, while they are found."""
+
+    records: list[Record] = dataclasses.field(default_factory=list)
+    modes: list[np.ndarray] = dataclasses.field(default_factory=list)
+    special: list[tuple[int, Bifurcation]] = dataclasses.field(default_factory=list)
+    end: str = ""
+
+    def add(self, record: Record, mode: np.ndarray) -> None:
+        self.records.append(record)
+        self.modes.append(mode)
+
+    def note(self, bifurcation: Bifurcation) -> None:
+        self.special.append((len(self.records) - 1, bifurcation))
+
+    def reversed(self) -> "Strand":
+        last = len(self.records) - 1
+        return Strand(self.records[::-1], self.modes[::-1], [(last - i, b) for i, b in self.special[::-1]], self.end)
+
+    def closed(self) -> bool:
+        return self.end == CLOSED
+
+
+def branch_of(system: System, parameter: str, back: Strand, ahead: Strand) -> Branch:
+    """Two strands that set out from one point as one branch: upwards, if there is a choice."""
+    ends = (back.end, ahead.end)
+    back = back.reversed()
+    # The common point is there once, or, where eigenvalues jump, from both sides.
+    corner = bool(back.special) and back.special[-1][0] == len(back.records) - 1 and back.special[-1][1].discontinuous
+    keep = len(back.records) - (0 if corner else 1)
+    strand = Strand(back.records[: max(keep, 0)] + ahead.records, back.modes[: max(keep, 0)] + ahead.modes)
+    strand.special = [(i, b) for i, b in back.special if i < keep]
+    last = strand.special[-1][1] if corner and strand.special else None
+    strand.special += [(i + max(keep, 0), b) for i, b in ahead.special if b is not last or i > 0]
+    if float(strand.records[0].parameter) > float(strand.records[-1].parameter):
+        strand, ends = strand.reversed(), ends[::-1]
+    tree = jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *strand.records)
+    return Branch(
+        system=system,
+        parameter=parameter,
+        values=tree.parameter,
+        ys=tree.y,
+        modes=np.stack([mode[0] for mode in strand.modes]),
+        multipliers=tree.multipliers,
+        eigenvalues=tree.eigenvalues,
+        unstable=unstable_number(tree.eigenvalues),
+        stable=tree.stable,
+        special=tuple(b for _, b in strand.special),
+        indices=tuple(i for i, _ in strand.special),
+        ends=ends,
+    )

@@ -1,0 +1,227 @@
+"""Solution curves of N equations for N + 1 unknowns: the compiled parts of a pseudo-arclength continuation."""
+
+import abc
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from ..._numerics._root import find_root
+from ...setvalued._pencil import bialternate
+
+
+# Test functions, before those of the guards. A curve leaves its interval at LOW and HIGH, and passes the parameter's
+# value at the start at MARK; FOLD is the parameter's part of the tangent, BRANCH the determinant of the equations
+# bordered by the tangent, PAIR a product of all sums of two eigenvalues.
+LOW, HIGH, MARK, FOLD, BRANCH, PAIR, GUARDS = range(7)
+TOLERANCE = 1e-12
+
+
+class Curve(eqx.Module):
+    """Equations for unknowns `u`, in units in which lengths along the curve are measured. The last is the parameter,
+    from 0 at the lower end of its interval to 1 at the upper one. In each of several modes they are smooth."""
+
+    mark: eqx.AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def residual(self, u: Float[Array, " n+1"], mode: Int[Array, "..."]) -> Float[Array, " n"]:
+        """What vanishes on the curve."""
+
+    @abc.abstractmethod
+    def guards(self, u: Float[Array, " n+1"]) -> Float[Array, " guards"]:
+        """Functions at whose zeros the mode may change."""
+
+    @abc.abstractmethod
+    def motion(self, u: Float[Array, " n+1"], mode: Int[Array, "..."]) -> Float[Array, "m m"]:
+        """A matrix of whose eigenvalues two have the sum zero where a pair is on the imaginary axis."""
+
+    @abc.abstractmethod
+    def record(self, u: Float[Array, " n+1"], mode: Int[Array, "..."]) -> Any:
+        """What is kept of a point."""
+
+
+class Probe(NamedTuple):
+    """Test functions at a point, and their derivatives along the curve."""
+
+    values: Float[Array, " tests"]
+    slopes: Float[Array, " tests"]
+
+
+class Step(NamedTuple):
+    """From a point, at which the test functions are `here`, to the next."""
+
+    u: Float[Array, " n+1"]
+    tangent: Float[Array, " n+1"]
+    here: Probe
+    there: Probe
+    record: Any
+    good: Bool[Array, ""]
+
+
+def _tangent(curve: Curve, u: Array, border: Array, mode: Array) -> Array:
+    """Of length one, and along `border`."""
+    whole = jnp.concatenate([jax.jacfwd(curve.residual)(u, mode), border[None]])
+    tangent = jnp.linalg.solve(whole, jnp.zeros_like(u).at[-1].set(1))
+    return tangent / jnp.linalg.norm(tangent)
+
+
+def distances(curve: Curve, u: Array) -> Array:
+    """The guards, divided by their gradients."""
+    gradients = jnp.linalg.norm(jax.lax.stop_gradient(jax.jacfwd(curve.guards)(u)), axis=-1)
+    return curve.guards(u) / jnp.where(gradients == 0, 1, gradients)
+
+
+def _determinants(curve: Curve, u: Array, border: Array, mode: Array) -> tuple[Array, Array]:
+    """Signs and logarithms of those for branch points and for pairs, which may be out of range themselves."""
+    motion = curve.motion(u, mode)
+    sums = 2 * bialternate(motion, jnp.eye(len(motion), dtype=u.dtype))
+    whole = jnp.concatenate([jax.jacfwd(curve.residual)(u, mode), border[None]])
+    pairs = jnp.linalg.slogdet(sums) if len(motion) > 1 else (jnp.ones((), u.dtype), jnp.zeros((), u.dtype))
+    signs, logs = zip(jnp.linalg.slogdet(whole), pairs)
+    return jnp.stack(signs), jnp.stack(logs)
+
+
+def _scale(curve: Curve, origin: Array, border: Array, mode: Array) -> Array:
+    """What determinants are divided by along a step."""
+    logs = _determinants(curve, origin, border, mode)[1]
+    return jnp.where(jnp.isfinite(logs), logs, 0)
+
+
+def _tests(curve: Curve, u: Array, border: Array, mode: Array, scale: Array) -> Array:
+    tangent = _tangent(curve, u, border, mode)
+    signs, logs = _determinants(curve, u, border, mode)
+    first = jnp.stack([u[-1], 1 - u[-1], u[-1] - curve.mark, tangent[-1]])
+    return jnp.concatenate([first, signs * jnp.exp(logs - scale), distances(curve, u)])
+
+
+def _probe(curve: Curve, u: Array, border: Array, mode: Array, scale: Array) -> Probe:
+    tangent = _tangent(curve, u, border, mode)
+    return Probe(*jax.jvp(lambda u: _tests(curve, u, border, mode, scale), (u,), (tangent,)))
+
+
+def _corrected(curve: Curve, origin: Array, tangent: Array, s: Array, guess: Array, mode: Array) -> tuple[Array, Array]:
+    """The point of the curve at the distance `s` from `origin` along its tangent."""
+    slopes = jax.jacfwd(curve.residual)(guess, mode)
+    # Equations in units of the unknowns, so that tolerances mean the same for all.
+    rows = jnp.max(jnp.abs(slopes), axis=1)
+    rows = jnp.where(rows == 0, 1, rows)
+
+    def residual(u: Array, _: Any) -> Array:
+        return jnp.append(curve.residual(u, mode) / rows, tangent @ (u - origin) - s)
+
+    return find_root(residual, guess, None, TOLERANCE, 12)
+
+
+@eqx.filter_jit
+def advance(curve: Curve, u: Array, tangent: Array, s: Array, mode: Array) -> Step:
+    """One step of length `s` along the curve."""
+    end, good = _corrected(curve, u, tangent, s, u + s * tangent, mode)
+    ahead, scale = _tangent(curve, end, tangent, mode), _scale(curve, u, tangent, mode)
+    here, there = _probe(curve, u, tangent, mode, scale), _probe(curve, end, tangent, mode, scale)
+    good = good & jnp.all(jnp.isfinite(ahead)) & jnp.all(jnp.isfinite(there.values))
+    return Step(end, ahead, here, there, curve.record(end, mode), good)
+
+
+class Place(NamedTuple):
+    """A point found on the curve, and the tangent just before it."""
+
+    s: Float[Array, ""]
+    u: Float[Array, " n+1"]
+    tangent: Float[Array, " n+1"]
+    value: Float[Array, ""]
+    good: Bool[Array, ""]
+
+
+@eqx.filter_jit
+def locate(
+    curve: Curve, step: Step, origin: Array, tangent: Array, ends: Array, mode: Array, which: Array, slope: Array
+) -> Place:
+    """Where between the distances `ends` along `tangent` a test function, or its derivative, is zero: by bisection,
+    which needs no derivative of it, on the curve, whose equations are regular there."""
+    length, scale = tangent @ (step.u - origin), _scale(curve, origin, tangent, mode)
+
+    def at(s: Array) -> tuple[Array, Array]:
+        return _corrected(curve, origin, tangent, s, origin + s / length * (step.u - origin), mode)
+
+    def value(s: Array) -> Array:
+        probe = _probe(curve, at(s)[0], tangent, mode, scale)
+        return jnp.where(slope, probe.slopes[which], probe.values[which])
+
+    sign = jnp.where(value(ends[1]) < 0, -1.0, 1.0).astype(origin.dtype)
+    solver = optx.Bisection(rtol=1e-15, atol=1e-15, flip=False)
+    found = optx.root_find(
+        lambda s, _: sign * value(s),
+        solver,
+        jnp.mean(ends),
+        options=dict(lower=ends[0], upper=ends[1]),
+        max_steps=70,
+        throw=False,
+    )
+    # Where the equations are singular exactly, a place beside it is known.
+    exact = at(found.value)[0]
+    beside = found.value - 1e-7 * (ends[1] - ends[0])
+    s = jnp.where(jnp.all(jnp.isfinite(exact)), found.value, beside)
+    u, good = at(s)
+    probe = _probe(curve, u, tangent, mode, scale)
+    # The tangent with which it is reached: on the surface itself a field may have a kink that no switch tells of.
+    arriving = _tangent(curve, at(s * (1 - 1e-6))[0], tangent, mode)
+    return Place(s, u, arriving, probe.values[which], good)
+
+
+@eqx.filter_jit
+def on_surface(curve: Curve, u: Array, mode: Array, which: Array) -> Array:
+    """The point of the curve, next to `u`, at which a guard vanishes."""
+
+    def residual(u: Array, _: Any) -> Array:
+        return jnp.append(curve.residual(u, mode), distances(curve, u)[which])
+
+    found, good = find_root(residual, u, None, TOLERANCE, 12)
+    return jnp.where(good, found, u)
+
+
+@eqx.filter_jit
+def branch_point(curve: Curve, u: Array, mode: Array) -> tuple[Array, Bool[Array, ""]]:
+    """A simple branch point near `u`: with ψ the left null vector of DF, F + β ψ = 0, ψᵀ DF = 0, |ψ| = 1 are regular
+    equations there, where F = 0 itself is not; Moore (1980)."""
+    left = jnp.linalg.svd(jax.jacfwd(curve.residual)(u, mode), full_matrices=False)[0][:, -1]
+
+    def residual(z: tuple, _: Any) -> tuple:
+        u, psi, beta = z
+        pull = jax.vjp(lambda u: curve.residual(u, mode), u)[1](psi)[0]
+        return curve.residual(u, mode) + beta * psi, pull, psi @ psi - 1
+
+    (u, _, beta), good = find_root(residual, (u, left, jnp.zeros((), u.dtype)), None, TOLERANCE, 20)
+    return u, good & (jnp.abs(beta) < 1e-9)
+
+
+@eqx.filter_jit
+def linearised(curve: Curve, u: Array, mode: Array) -> tuple[Array, Array]:
+    """F and DF."""
+    return curve.residual(u, mode), jax.jacfwd(curve.residual)(u, mode)
+
+
+@eqx.filter_jit
+def row_sizes(curve: Curve, u: Array, mode: Array) -> Array:
+    """Of the rows of DF: what they have, or would have a unit further on, where all of a row vanishes here."""
+    first = jax.jacfwd(curve.residual)
+    size = jnp.max(jnp.abs(first(u, mode)), axis=1) + jnp.max(jnp.abs(jax.jacfwd(first)(u, mode)), axis=(1, 2))
+    return jnp.where(size > 0, size, 1)
+
+
+@eqx.filter_jit
+def branching(curve: Curve, u: Array, kernel: Float[Array, "2 n+1"], left: Array, mode: Array) -> Float[Array, "2 2"]:
+    """ψᵀ D²F φ_i φ_j for the kernel φ_1, φ_2 of DF and ψ of its transpose: the branches through a simple branch point
+    have the directions a φ_1 + b φ_2 on which this vanishes; Keller (1977)."""
+
+    def along(a: Array, b: Array) -> Array:
+        return left @ curve.residual(u + a * kernel[0] + b * kernel[1], mode)
+
+    zero = jnp.zeros((), u.dtype)
+    return jnp.stack([jnp.stack(row) for row in jax.hessian(along, (0, 1))(zero, zero)])
+
+
+near = eqx.filter_jit(distances)
+kept = eqx.filter_jit(lambda curve, u, mode: curve.record(u, mode))

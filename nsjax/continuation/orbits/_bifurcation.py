@@ -1,0 +1,234 @@
+"""Special points of branches of periodic orbits."""
+
+import textwrap
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.flatten_util as jfu
+import numpy as np
+
+from ..._numerics._text import listed, shown
+from ..._types import Y
+from ...maps._corner_normal_form import CornerKind
+from ...orbits.segments._equations import OrbitCurve
+from ...setvalued._pencil import EigenvalueCrossing
+from ..equilibria._bifurcation import half_branch
+from ._test_functions import Test
+from ._tracer import Spot
+
+
+SMOOTH = {kind: kind for kind in ("fold", "flip", "Neimark-Sacker")}  # and the test function that tells it
+ONES = ("fold", "symmetry breaking", "transcritical", "branch point", "3 to 1", "1 to 3")
+
+
+class Origin(NamedTuple):
+    """A special point as the continuation saw it: what vanishes there, where, and on which curve."""
+
+    test: Test
+    spot: Spot
+    curve: OrbitCurve
+
+    def __repr__(self) -> str:
+        return f"Origin({self.test.kind})"
+
+
+@shown
+class OrbitHalf(NamedTuple):
+    """A branch on one side of a special point.
+
+    **Attributes:**
+
+    - `side`: -1 if it lies below the point's parameter value, +1 above it.
+    - `laps`: its period over that of the orbit at the point.
+    - `multipliers`: the limits of its multipliers, at the point.
+    - `stable`: whether its orbits are, next to the point.
+    - `itinerary`: the modes it passes through.
+    """
+
+    side: int
+    laps: int
+    multipliers: np.ndarray
+    stable: bool
+    itinerary: str
+
+    def __str__(self) -> str:
+        way = textwrap.shorten(self.itinerary, 60, placeholder=" ...") or "no events"
+        multipliers = listed(self.multipliers, 4, 2)
+        return f"{half_branch(self.stable, self.side)}, period {self.laps}: {way}; multipliers {multipliers}"
+
+
+@shown
+class OrbitBifurcation(NamedTuple):
+    """A special point of a branch of periodic orbits.
+
+    **Attributes:**
+
+    - `kind`: "fold", "flip", "Neimark-Sacker", "symmetry breaking", "transcritical"; "fold-flip" where set-valued
+        multipliers cross the circle at both 1 and -1 (section 6.9); "infinitely unstable fold" where one jumps from 0
+        to infinity (section 6.7); "multiple crossing", or "3 to 1" (so many orbits below and above) for what has no
+        name; "none" where the itinerary changes without a bifurcation, "end" where there is no orbit nearby beyond.
+    - `discontinuous`: whether it is a corner: multipliers jump there.
+    - `criticality`: "supercritical", "subcritical", or None if the kind knows no such thing.
+    - `evidence`: what supports the kind: "count" of the orbits (Definition 5.1), "crossing" of the unit circle by
+        set-valued multipliers (Conjecture 6.2; at a smooth point by multipliers), or "both".
+    - `by_count`: the kind that the number of orbits on each side suggests: (periods below, periods above) in `count`.
+    - `by_crossing`: the kinds that the crossings suggest; None if a multiplier jumps to infinity.
+    - `transition`: for a corner at which sliding begins or ends, "sliding": a topological transition, also where it is
+        no bifurcation (section 7.2).
+    - `parameter`, `value`: its name, and the value at the point.
+    - `period`: of the orbit there. `y`: a state on it (at its first event), at the time `t`.
+    - `count`: the periods of the orbits that meet there, as multiples of that of the orbit, below and above.
+    - `surfaces`: the switches whose surfaces the orbit touches.
+    - `multipliers`: one-sided limits: of the branch that came, and of its continuation.
+    - `monodromies`: the matrices that belong to them: the ends of the set-valued one (6.13).
+    - `crossings`: of the unit circle on the way from one to the other.
+    - `halves`: the half-branches that meet there.
+    - `origin`: what `continue_bifurcation` sets out from; None if the point was loaded.
+    """
+
+    kind: str
+    discontinuous: bool
+    criticality: str | None
+    evidence: str
+    by_count: str
+    by_crossing: tuple[str, ...] | None
+    transition: str | None
+    parameter: str
+    value: float
+    period: float
+    t: float
+    y: Y
+    count: tuple[tuple[int, ...], tuple[int, ...]]
+    surfaces: tuple[str, ...]
+    multipliers: tuple[np.ndarray, np.ndarray]
+    monodromies: tuple[np.ndarray, np.ndarray]
+    crossings: Sequence[EigenvalueCrossing]
+    halves: Sequence[OrbitHalf]
+    origin: "Origin | None" = None
+
+    @property
+    def name(self) -> str:
+        """As the thesis says it: "discontinuous fold bifurcation"."""
+        if self.kind == "none":
+            jump = not np.allclose(*self.multipliers, rtol=1e-5, atol=1e-6)
+            plain = "the multipliers jump" if jump else "the itinerary changes"
+            return "no bifurcation: " + ("sliding-mode transition" if self.transition else plain)
+        if self.kind == "end":
+            return "end of the branch"
+        words = ["discontinuous"] * self.discontinuous + [self.kind, "bifurcation"]
+        return " ".join(words) + (f", {self.criticality}" if self.criticality else "")
+
+    def __str__(self) -> str:
+        lines = [f"{self.name} at {self.parameter} = {self.value:.12g}, period {self.period:.12g}"]
+        if self.surfaces:
+            lines.append(f"  surfaces     {', '.join(self.surfaces)}")
+        below, above = (" ".join(map(str, side)) or "none" for side in self.count)
+        lines.append(f"  evidence     {self.evidence}: periods {below} | {above} ({self.by_count})")
+        before, after = (listed(side, 8) for side in self.multipliers)
+        lines.append(f"  multipliers  {before} | {after}" if self.discontinuous else f"  multipliers  {before}")
+        lines += [f"  crossing     {crossing}" for crossing in self.crossings]
+        return "\n".join(lines)
+
+    @classmethod
+    def smooth(
+        cls, kind: str, name: str, spot: Any, curve: Any, halves: Sequence[OrbitHalf], side: int = 0
+    ) -> "OrbitBifurcation":
+        """A point at which a multiplier crosses the circle without a jump; of a fold, on which side its orbits are."""
+        below, above = (tuple(sorted(h.laps for h in halves if h.side == side)) for side in (-1, 1))
+        if kind == "flip":
+            below, above = tuple(sorted((1, *below))), tuple(sorted((1, *above)))
+        if kind == "fold":
+            below, above = ((), (1, 1)) if side > 0 else ((1, 1), ())
+        alone = kind == "Neimark-Sacker"  # of what is born there nothing is periodic
+        if alone:
+            below = above = (1,)
+        criticality = None
+        born = [h for h in halves if h.laps == 2] if kind == "flip" else _twins(halves)
+        if kind in ("flip", "symmetry breaking") and born:
+            criticality = "supercritical" if born[0].stable else _criticality(spot, born[0])
+        return cls(
+            kind=kind, discontinuous=False, criticality=criticality, evidence="both" if halves else "crossing",
+            by_count="none" if alone else kind, by_crossing=(kind,), transition=None, count=(below, above), surfaces=(),
+            crossings=[],
+            multipliers=(spot.multipliers, spot.multipliers), monodromies=(spot.monodromy, spot.monodromy),
+            halves=halves, origin=Origin(Test(SMOOTH.get(kind, "branch")), spot, curve), **_common(name, spot, curve),
+        )  # fmt: skip
+
+    @classmethod
+    def repelled(
+        cls, name: str, spot: Any, curve: Any, halves: Sequence[OrbitHalf], surfaces: tuple[str, ...]
+    ) -> "OrbitBifurcation":
+        below, above = (tuple(1 for h in halves if h.side == side) for side in (-1, 1))
+        kind = "infinitely unstable fold" if len(below) != len(above) else "none"
+        return cls(
+            kind=kind, discontinuous=True, criticality=None, evidence="both" if kind != "none" else "count",
+            by_count="fold" if kind != "none" else "none", by_crossing=("fold",), transition="sliding",
+            count=(below, above), surfaces=surfaces, crossings=[], halves=halves,
+            multipliers=(halves[0].multipliers, halves[1].multipliers),
+            monodromies=(spot.monodromy, np.full_like(spot.monodromy, np.inf)), **_common(name, spot, curve),
+        )  # fmt: skip
+
+    @classmethod
+    def end(cls, name: str, spot: Any, curve: Any, surfaces: tuple[str, ...], side: int) -> "OrbitBifurcation":
+        """Where the orbits on one side have none nearby to go on to."""
+        below, above = (((1,) if side == s else ()) for s in (-1, 1))
+        return cls(
+            kind="end", discontinuous=True, criticality=None, evidence="count", by_count="end", by_crossing=None,
+            transition=None, count=(below, above), surfaces=surfaces, crossings=[], halves=[],
+            multipliers=(spot.multipliers, spot.multipliers), monodromies=(spot.monodromy, spot.monodromy),
+            **_common(name, spot, curve),
+        )  # fmt: skip
+
+
+def _common(name: str, spot: Any, curve: Any) -> dict[str, Any]:
+    look = spot.look
+    y = jfu.ravel_pytree(curve.like)[1](np.asarray(look.x[0]))
+    return dict(parameter=name, value=spot.parameter, period=float(look.period), t=float(look.begin[0]), y=y)
+
+
+def _twins(halves: Sequence[OrbitHalf]) -> list[OrbitHalf]:
+    """The two that lie on the side on which there are three."""
+    for side in (-1, 1):
+        here = [h for h in halves if h.side == side]
+        if len(here) == 3:
+            return [h for h in here if sum(h.stable == o.stable for o in here) == 2]
+    return []
+
+
+def _criticality(spot: Any, born: OrbitHalf) -> str:
+    unstable = int(np.sum(np.abs(born.multipliers) > 1 + 1e-9))
+    at = int(np.sum(np.abs(spot.multipliers) > 1 + 1e-6))
+    return "supercritical" if unstable <= at else "subcritical"
+
+
+def named(
+    by_count: CornerKind,
+    crossings: Sequence[EigenvalueCrossing] | None,
+    name: str,
+    spot: Any,
+    curve: Any,
+    halves: Sequence[OrbitHalf],
+    surfaces: tuple[str, ...],
+    monodromies: tuple[np.ndarray, np.ndarray],
+    multipliers: tuple[np.ndarray, np.ndarray],
+    transition: str | None,
+) -> OrbitBifurcation:
+    """A corner, by the number of orbits on each side, and by the crossings of the unit circle (Conjecture 6.2)."""
+    names = {"+1": "fold", "-1": "flip", "pair": "Neimark-Sacker"}
+    by_crossing = None if crossings is None else tuple(names[c.kind] for c in crossings)
+    kind, evidence = by_count.kind, "count"
+    if by_crossing is not None:
+        expected = {
+            "none": [], "fold": ["fold"], "flip": ["flip"], "fold-flip": ["flip", "fold"],
+            "symmetry breaking": ["fold"], "transcritical": ["fold"],
+        }.get(kind)  # fmt: skip
+        evidence = "both" if expected == sorted(by_crossing) else "count"
+        pairs = [k for k in by_crossing if k not in ("fold", "flip")]
+        if kind == "none" and pairs:
+            kind, evidence = pairs[0], "crossing"
+    return OrbitBifurcation(
+        kind=kind, discontinuous=True, criticality=by_count.criticality, evidence=evidence, by_count=by_count.kind,
+        by_crossing=by_crossing, transition=transition,
+        count=(by_count.below, by_count.above), surfaces=surfaces, crossings=crossings or [], halves=halves,
+        multipliers=multipliers, monodromies=monodromies, **_common(name, spot, curve),
+    )  # fmt: skip

@@ -1,0 +1,282 @@
+"""Branches of periodic orbits."""
+
+import dataclasses
+import math
+import os
+from typing import Any, Generic, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+from ..._numerics._text import shown
+from ..._types import StateT, Y
+from ...orbits._find_orbit import find_orbit
+from ...orbits._orbit import Orbit
+from ...orbits.segments._equations import OrbitCurve
+from ...orbits.segments._guess import Segment
+from ...orbits.segments._itinerary import FREE, LEAST, TIME
+from ...setvalued._pencil import EigenvalueCrossing
+from ...system._parameter import parameter_path, put_parameter
+from ...system._system import System
+from .._archive import Archive, save, table
+from ._bifurcation import OrbitBifurcation, OrbitHalf, Origin
+from ._record import states_of
+from ._tracer import midpoint, Spot
+
+
+NOT_BIFURCATIONS = ("none", "end")
+
+
+@shown
+class OrbitBranch(eqx.Module, Generic[StateT]):
+    """A curve of periodic orbits over a parameter.
+
+    **Attributes:**
+
+    - `system`, `parameter`: the model, and the name of the parameter.
+    - `values`: of the parameter, at each point.
+    - `periods`: of the orbits [time]. `orders`: over that of the forcing; ones if there is none.
+    - `ts`, `ys`: a time, and the state of each orbit then, away from events and from where it sticks; leaves with a
+        leading axis.
+    - `low`, `high`, `mean`: of each component of the state along the orbit, in the structure of `ys`.
+    - `multipliers`: shape `(points, n)`, largest modulus first; infinite on orbits that are infinitely unstable.
+    - `stable`: whether all but the trivial one are inside the unit circle.
+    - `admissible`: whether they are orbits of the system: false along a virtual branch, on which the segments of the
+        orbits at a corner are followed beyond it, whatever surfaces they pass, or with a negative duration.
+    - `itineraries`: the modes that each orbit passes through, as text.
+    - `segments`: of each orbit, from its time in `ts` on: a guess for `find_orbit`.
+    - `records`: what the functions `record` of `continue_orbit` gave, by name; arrays with a leading axis.
+    - `special`: the special points on it, in their order.
+    - `indices`: at which point of the branch each is. A corner is there with the limits of its multipliers from both
+        sides, at `indices` and the point after.
+    - `ends`: why it begins and ends where it does.
+    - `others`: the other branches that were found, on the one that `continue_orbit` returns.
+    """
+
+    system: System
+    parameter: str
+    values: Float[np.ndarray, " points"]
+    periods: Float[np.ndarray, " points"]
+    orders: Int[np.ndarray, " points"]
+    ts: Float[np.ndarray, " points"]
+    ys: Y
+    low: Y
+    high: Y
+    mean: Y
+    multipliers: Complex[np.ndarray, "points n"]
+    stable: Bool[np.ndarray, " points"]
+    admissible: Bool[np.ndarray, " points"]
+    itineraries: tuple[str, ...]
+    segments: tuple[tuple[Segment, ...], ...]
+    records: dict[str, np.ndarray]
+    special: tuple[OrbitBifurcation, ...]
+    indices: tuple[int, ...]
+    ends: tuple[str, str]
+    others: "tuple[OrbitBranch[StateT], ...]" = ()
+
+    @property
+    def branches(self) -> "tuple[OrbitBranch[StateT], ...]":
+        """This one and the others."""
+        return (self, *self.others)
+
+    @property
+    def special_points(self) -> tuple[OrbitBifurcation, ...]:
+        """Those of all branches, each once, in the order of the parameter."""
+        found: dict[int, OrbitBifurcation] = {}
+        for branch in self.branches:
+            found |= {id(b): b for b in branch.special}
+        return tuple(sorted(found.values(), key=lambda b: b.value))
+
+    @property
+    def bifurcations(self) -> tuple[OrbitBifurcation, ...]:
+        """Those of them that are bifurcations."""
+        return tuple(b for b in self.special_points if b.kind not in NOT_BIFURCATIONS)
+
+    def system_at(self, index: int) -> System:
+        """The model with the parameter's value at a point."""
+        path = parameter_path(self.system, self.parameter)
+        return put_parameter(self.system, path, jnp.asarray(self.values[index]))
+
+    def orbit(self, index: int, **options: Any) -> Orbit[StateT]:
+        """The orbit at a point of the branch, for all that can be done with an `Orbit`.
+
+        **Arguments:**
+
+        - `index`: which point.
+        - `options`: for `find_orbit`. The orbit is found in segments, however unstable it is, which is a program for
+            each number of them; with `method="shooting"`, for orbits that are not very unstable, it is one for all.
+
+        **Returns:** the `Orbit`, of `system_at(index)`.
+
+        **Raises:** `ValueError` for a point of a virtual branch.
+        """
+        if not self.admissible[index]:
+            raise ValueError(
+                f"Argument `index` must be that of an orbit of the system, but point {index} of this branch is virtual."
+            )
+        system, t0 = self.system_at(index), self.ts[index]
+        guess: dict[str, Any] = dict(segments=self.segments[index])
+        if options.get("method") == "shooting":
+            guess = dict(period=self.periods[index]) if system.period is None else {}
+        y0 = jax.tree.map(lambda x: jnp.asarray(x[index]), self.ys)
+        return find_orbit(system, y0, t0=t0, order=int(self.orders[index]), **guess, **options)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes the branch and the others to a file, an `.npz` of plain arrays with a description in JSON."""
+        save(
+            path, "OrbitBranch", TYPES, self.system, jax.tree.map(lambda x: x[0], self.ys), {"branch": self}, (Origin,)
+        )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike, system: System, y: Y | None = None) -> "OrbitBranch":
+        """Reads what `save` wrote. Nothing in the file is executed.
+
+        **Arguments:**
+
+        - `path`: the file.
+        - `system`: a model of the same class and shapes; the values of its parameters are taken from the file.
+        - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
+            NamedTuples.
+
+        **Raises:** `ValueError` for a file that is damaged, is none of `save`'s, or is of another model.
+        """
+        return Archive(path, "OrbitBranch", TYPES, system, y).part("branch")
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __str__(self) -> str:
+        count = sum(bool(branch.admissible.any()) for branch in self.branches)
+        virtual = f", {len(self.branches) - count} virtual" if count < len(self.branches) else ""
+        owner = type(self.system).__name__
+        lines = [f"{count} {'branch' if count == 1 else 'branches'} of periodic orbits of {owner}{virtual}"]
+        seen: list[Any] = []
+        for branch in self.branches:
+            low, high = float(np.min(branch.values)), float(np.max(branch.values))
+            words = ["stable" if s else "unstable" for s in branch.stable]
+            words = [word if real else "virtual" for word, real in zip(words, branch.admissible)]
+            runs = [word for i, word in enumerate(words) if i == 0 or words[i - 1] != word]
+            told = ", then ".join(runs) if len(runs) <= 6 else f"{len(runs) - 1} changes of stability"
+            order = int(branch.orders[0])
+            period = f"period {order}, " if branch.system.period is not None else ""
+            lines.append(f"  {period}{self.parameter} in [{low:.6g}, {high:.6g}]: {len(branch)} points, {told}")
+            lines.append(f"    from {branch.ends[0]} to {branch.ends[1]}")
+            for special in branch.special:
+                known = any(special is other for other in seen)
+                lines += [f"    {line}" for line in str(special).splitlines()[: 1 if known else None]]
+                seen.append(special)
+        return "\n".join(lines)
+
+
+TYPES = table(OrbitBranch, OrbitBifurcation, OrbitHalf, EigenvalueCrossing, Segment)
+
+
+class Point(NamedTuple):
+    """A point of a strand, of how many periods of the forcing its orbit is, the user's measures of it, and whether the
+    system has such an orbit."""
+
+    spot: Spot
+    order: int
+    record: dict[str, np.ndarray]
+    admissible: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class OrbitStrand:
+    """Points one after the other, and the special ones among them."""
+
+    points: tuple[Point, ...] = ()
+    special: tuple[tuple[int, OrbitBifurcation], ...] = ()
+    end: str = "here, so far"
+
+    def then(self, point: Point) -> "OrbitStrand":
+        return dataclasses.replace(self, points=(*self.points, point))
+
+    def ending(self, point: Point) -> "OrbitStrand":
+        """With another last point."""
+        return dataclasses.replace(self, points=(*self.points[:-1], point))
+
+    def noting(self, bifurcation: OrbitBifurcation) -> "OrbitStrand":
+        """With the last point as a special one."""
+        return dataclasses.replace(self, special=(*self.special, (len(self.points) - 1, bifurcation)))
+
+    def reversed(self) -> "OrbitStrand":
+        values, last = [point.spot.parameter for point in self.points], len(self.points) - 1
+
+        def index(i: int) -> int:
+            """Of a corner that is there twice, the first of the two."""
+            twice = i < last and math.isclose(values[i + 1], values[i], rel_tol=1e-10)
+            return last - i - 1 if twice else last - i
+
+        return OrbitStrand(self.points[::-1], tuple((index(i), b) for i, b in self.special[::-1]), self.end)
+
+
+def orbit_branch(
+    curve: OrbitCurve, system: System, parameter: str, back: OrbitStrand, ahead: OrbitStrand, itinerary: Any
+) -> OrbitBranch:
+    """Two strands that set out from one point as one branch: upwards, if there is a choice; a virtual one, away from
+    where it begins."""
+    ends = (back.end, ahead.end)
+    first, keep = back.reversed(), len(back.points)
+    common = bool(first.special and ahead.special) and first.special[-1][1] is ahead.special[0][1]
+    if keep and ahead.points and not common:
+        keep -= first.points[-1].spot.look.u is ahead.points[0].spot.look.u
+    strand = OrbitStrand(
+        first.points[:keep] + ahead.points,
+        tuple((i, b) for i, b in first.special if i < keep)
+        + tuple((i + keep, b) for i, b in ahead.special if not (common and i == 0)),
+    )
+    start, stop = strand.points[0], strand.points[-1]
+    if start.admissible and start.spot.parameter > stop.spot.parameter:
+        strand, ends = strand.reversed(), ends[::-1]
+    spots = [point.spot for point in strand.points]
+
+    def column(rows: list[np.ndarray]) -> Any:
+        return states_of(curve.like, np.stack(rows))
+
+    bases = [midpoint(curve, spot, spot.course.rows) for spot in spots]
+    texts: dict[int, str] = {}
+    return OrbitBranch(
+        system=system,
+        parameter=parameter,
+        values=np.array([spot.parameter for spot in spots]),
+        periods=np.array([float(spot.look.period) for spot in spots]),
+        orders=np.array([point.order for point in strand.points]),
+        ts=np.array([t for t, _, _ in bases]),
+        ys=column([x for _, x, _ in bases]),
+        low=column([spot.look.low for spot in spots]),
+        high=column([spot.look.high for spot in spots]),
+        mean=column([spot.look.mean for spot in spots]),
+        multipliers=np.stack([np.asarray(spot.multipliers, complex) for spot in spots]),
+        stable=np.array([spot.stable for spot in spots]),
+        admissible=np.array([point.admissible for point in strand.points]),
+        segments=tuple(segments_of(curve, spot, t) for spot, (t, _, _) in zip(spots, bases)),
+        itineraries=tuple(texts.setdefault(id(s.course), itinerary(curve, s.course)) for s in spots),
+        records={name: np.stack([point.record[name] for point in strand.points]) for name in strand.points[0].record},
+        special=tuple(b for _, b in strand.special),
+        indices=tuple(i for i, _ in strand.special),
+        ends=ends,
+    )
+
+
+def segments_of(curve: OrbitCurve, spot: Spot, t: float) -> tuple[Segment, ...]:
+    """The segments of an orbit from a time within one of them on; that one comes first and last."""
+    look, course, model = spot.look, spot.course, curve.model
+    modes = [tuple(course.mode[i].tolist()) for i in course.rows]
+    lengths = [float(look.end[i] - look.begin[i]) for i in course.rows]
+    if course.ends[0] == TIME:
+        return (Segment(modes[0], lengths[0]),)
+    middles = (look.begin + look.end)[: len(modes)] / 2
+    first = int(np.argmin(np.abs(middles - t)))
+    out, duration = [], float(look.end[first] - t)
+    for i in [*range(first, len(modes)), *range(first)]:
+        if i != first:
+            duration += lengths[i]
+        if course.ends[i] != LEAST:  # a cut that changes nothing
+            switch = model.switches[model.slots[int(course.slot[i])].switch].name
+            out.append(Segment(modes[i], duration, switch, bool(course.ends[i] == FREE)))
+            duration = 0.0
+    return (*out, Segment(modes[first], duration + float(t - look.begin[first])))

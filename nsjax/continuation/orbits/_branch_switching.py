@@ -1,0 +1,208 @@
+"""Points at which branches of periodic orbits meet, and the smooth ones among them: flips and branch points."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from ...maps._corner_normal_form import Cycle
+from ...orbits.segments._equations import linearised, OrbitCurve, state_at
+from ...orbits.segments._itinerary import capacity_for, Course, Start, TIME
+from ...orbits.segments._point import advance
+from ._bifurcation import OrbitBifurcation, OrbitHalf
+from ._test_functions import CORNERS
+from ._tracer import alike, midpoint, OrbitTracer, Spot, spot_of, told_by, turned, Zero
+
+
+BRANCHING = (3e-3, 1e-3, 1e-2, 3e-4, 1e-4, 1e-5)  # lengths of the step by which a branch is entered along its direction
+ALIKE = 1e-6  # two points that are nearer are one
+MOST_LAPS = 8  # in which an autonomous orbit may pass through the same points several times
+
+
+@dataclasses.dataclass
+class Half:
+    """A half-branch: the orbit on it next to the point, with its tangent away from it."""
+
+    spot: Spot
+    curve: OrbitCurve  # whose `order` is that of these orbits
+    laps: int
+    side: int
+    cycle: Cycle | None = None
+    partner: "Half | None" = None
+
+    @property
+    def multipliers(self) -> np.ndarray:
+        """Their limits at a corner."""
+        if self.cycle is None:
+            return self.spot.multipliers
+        if not self.curve.autonomous:
+            return self.cycle.multipliers
+        found = np.append(self.cycle.multipliers, 1.0)
+        return found[np.argsort(-np.abs(found), kind="stable")]
+
+
+@dataclasses.dataclass
+class Node:
+    """A point at which half-branches meet, those that go on into one another being partners."""
+
+    spot: Spot
+    order: int
+    halves: list[Half]
+    bifurcation: OrbitBifurcation
+
+    def is_at(self, zero: Zero, curve: OrbitCurve) -> bool:
+        """Whether it is this zero of a test function: a smooth bifurcation may be right beside a corner."""
+        smooth = zero.test.kind in ("flip", "branch")
+        return smooth != self.bifurcation.discontinuous and together(self.spot, zero.spot, curve, ALIKE)
+
+
+def together(a: Spot, b: Spot, curve: OrbitCurve, tolerance: float) -> bool:
+    """Whether two are the same orbit at the same parameter."""
+    return abs(a.parameter - b.parameter) < tolerance * float(curve.width) and alike(a, b, curve, tolerance)
+
+
+def with_order(curve: OrbitCurve, order: int) -> OrbitCurve:
+    return eqx.tree_at(lambda c: c.order, curve, np.asarray(order, np.int32))
+
+
+def tracer_for(tracer: OrbitTracer, curve: OrbitCurve) -> OrbitTracer:
+    return dataclasses.replace(tracer, curve=curve)
+
+
+def _kernel(tracer: OrbitTracer, course: Course, u: Any) -> np.ndarray:
+    return np.linalg.svd(np.asarray(linearised(tracer.curve, course, u)))[2][-2:]
+
+
+def set_out(tracer: OrbitTracer, course: Course, u: Any, direction: np.ndarray) -> Spot | None:
+    """An orbit on the branch that leaves `u` in this direction, with its tangent away from it."""
+    for step in BRANCHING:
+        look = advance(
+            tracer.curve, course, u, direction, np.asarray(step, np.float64), u + step * direction, np.asarray(True)
+        )
+        if not bool(look.good):
+            continue
+        spot = spot_of(tracer.curve, look, course)
+        if float(np.linalg.norm(spot.look.u - u)) < 5 * step and admissible(tracer.curve, spot):
+            return _along(spot, direction)
+    return None
+
+
+def _along(spot: Spot, direction: np.ndarray) -> Spot:
+    return spot if float(spot.look.tangent @ direction) >= 0 else turned(spot)
+
+
+def admissible(curve: OrbitCurve, spot: Spot) -> bool:
+    scale = float(spot.look.branch[1])
+    return all(v > -1e-9 for t, v in told_by(curve, spot, scale).items() if t.kind in CORNERS)
+
+
+def _repeated(spot: Spot, times: int, period: float) -> tuple[Course, Start]:
+    """The orbit several times."""
+    n = int(spot.course.num)
+    rows = list(range(n)) * times
+    course = spot.course.take(rows, capacity_for(len(rows)))
+    shift = np.repeat(np.arange(times) * period, n)
+    look = spot.look
+    first = (np.tile(look.begin[:n], times) + shift, np.tile(look.end[:n], times) + shift)
+    if course.ends[0] == TIME:  # one segment, for as long
+        course = spot.course
+        return course, Start(course, look.begin[:1], look.begin[:1] + times * period, look.x[:1])
+    return course, Start(course, *first, np.tile(look.x[:n], (times, 1)))
+
+
+def flip_at(tracer: OrbitTracer, name: str, spot: Spot) -> Node | None:
+    """Where a multiplier is -1: the orbit twice is a branch point of orbits of twice the period."""
+    curve = tracer.curve
+    course, start = _repeated(spot, 2, float(spot.look.period))
+    twice = tracer_for(tracer, with_order(curve, 2 * int(curve.order)))
+    u = twice.curve.pack(start, spot.parameter)
+    kernel = _kernel(twice, course, u)
+    # On the orbit twice the parameter moves; on what is born here it does not, to first order.
+    direction = np.array([-kernel[1][-1], kernel[0][-1]]) @ kernel
+    direction = direction / np.linalg.norm(direction)
+    born = set_out(twice, course, u, direction)
+    halves = []
+    if born is not None:
+        halves.append(Half(born, twice.curve, 2, side_of(born, spot, curve)))
+    made = OrbitBifurcation.smooth("flip", name, spot, curve, [told(half) for half in halves])
+    return Node(spot, int(curve.order), halves, made)
+
+
+def _across(kernel: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+    """The direction in the kernel across the part of a tangent in it."""
+    inside = kernel @ tangent
+    direction = np.array([-inside[1], inside[0]]) @ kernel
+    return direction / np.linalg.norm(direction)
+
+
+def branch_point_at(tracer: OrbitTracer, name: str, spot: Spot) -> Node | None:
+    """Where a multiplier is 1 and another branch crosses."""
+    curve = tracer.curve
+    n = int(spot.course.num)
+    cover = cover_of(spot, curve)
+    if cover == 2:  # seen from the branch of twice the period
+        rows = list(range(n // 2))
+        course = spot.course.take(rows, capacity_for(len(rows))) if n > 1 else spot.course
+        once = tracer_for(tracer, with_order(curve, int(curve.order) // 2))
+        start = Start(course, spot.look.begin[: len(rows)], spot.look.end[: len(rows)], spot.look.x[: len(rows)])
+        base = once.corrected(course, once.curve.pack(start, spot.parameter))
+        if base is None:
+            return None
+        node = flip_at(once, name, base)
+        if node is not None:
+            for other in (base, turned(base)):
+                side = int(np.sign(other.look.tangent[-1]))
+                node.halves.append(Half(other, once.curve, 1, side))
+            node.halves[-1].partner, node.halves[-2].partner = node.halves[-2], node.halves[-1]
+        return node
+    kernel = _kernel(tracer, spot.course, spot.look.u)
+    tangent = np.asarray(spot.look.tangent)
+    halves = []
+    for direction in (tangent, _across(kernel, tangent)):
+        pair = []
+        for sign in (1, -1):
+            born = set_out(tracer, spot.course, spot.look.u, sign * direction)
+            if born is not None:
+                pair.append(Half(born, curve, 1, side_of(born, spot, curve)))
+        if len(pair) == 2:
+            pair[0].partner, pair[1].partner = pair[1], pair[0]
+        halves += pair
+    sides = sorted(half.side for half in halves)
+    kind = "symmetry breaking" if sides in ([-1, -1, -1, 1], [-1, 1, 1, 1]) else "transcritical"
+    if len(halves) != 4:
+        kind = "branch point"
+    made = OrbitBifurcation.smooth(kind, name, spot, curve, [told(half) for half in halves])
+    return Node(spot, int(curve.order), halves, made)
+
+
+def cover_of(spot: Spot, curve: OrbitCurve, tolerance: float = 1e-4) -> int:
+    """How many times the orbit passes through the same points."""
+    look, n, order = spot.look, int(spot.course.num), int(curve.order)
+    period = float(look.period)
+    t, x, _ = midpoint(curve, spot, spot.course.rows)
+
+    def away(times: int) -> float:
+        later = float(look.begin[0]) + (t - float(look.begin[0]) + period / times) % period
+        i = next((i for i in range(n) if look.begin[i] <= later <= look.end[i]), n - 1)
+        args = (look.parameter, look.begin[i], later, look.x[i], spot.course.mode[i], spot.course.part[i])
+        return float(np.max(np.abs(np.asarray(state_at(curve, *args)) - x) / np.asarray(curve.sizes)))
+
+    most = MOST_LAPS if curve.autonomous else order
+    several = [k for k in range(most, 1, -1) if curve.autonomous or order % k == 0]
+    return next((k for k in several if away(k) < tolerance), 1)
+
+
+def side_of(half: Spot, at: Spot, curve: OrbitCurve) -> int:
+    return int(np.sign(half.parameter - at.parameter)) or int(np.sign(half.look.tangent[-1]))
+
+
+def told(half: Half) -> OrbitHalf:
+    spot = half.spot
+    return OrbitHalf(half.side, half.laps, half.multipliers, spot.stable, itinerary(half.curve, spot.course))
+
+
+def itinerary(curve: OrbitCurve, course: Course) -> str:
+    names = [k.name for k in curve.model.switches]
+    rows = [", ".join(f"{n} {int(m):+d}" for n, m in zip(names, course.mode[i])) for i in course.rows]
+    return " -> ".join(rows)

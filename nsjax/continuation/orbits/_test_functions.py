@@ -1,0 +1,69 @@
+"""Test functions: what vanishes at the special points along a branch of periodic orbits.
+
+Each is written once, in the namespace of its arrays: NumPy's for a point that is looked at, jax's within a program.
+"""
+
+from typing import Any, NamedTuple
+
+from ...derivatives._floquet import trivial
+from ...orbits.segments._equations import OrbitCurve
+from ...orbits.segments._itinerary import Course, EVENT, FREE, LEAST
+from ...orbits.segments._point import Look
+
+
+PASSED = ("fold", "flip", "Neimark-Sacker")  # bifurcations through which the branch goes on as it is
+CORNERS = ("duration", "margin", "rate", "guard")  # in the order in which what vanishes together is told by the first
+
+
+class Test(NamedTuple):
+    """A function whose zero is looked for: what it is, of which segment, and of which guard."""
+
+    kind: str
+    row: int = 0
+    slot: int = 0
+
+
+BRANCH = Test("branch")
+CIRCLE = (Test("flip"), Test("Neimark-Sacker"))
+
+
+def corner_tests(rows: int, slots: int) -> list[Test]:
+    """Of so many segments and guards, in the order of `corner_values`."""
+    of_segments = [Test(kind, i) for kind in ("rate", "margin", "duration") for i in range(rows)]
+    return of_segments + [Test("guard", i, j) for i in range(rows) for j in range(slots)]
+
+
+def corner_values(curve: OrbitCurve, look: Look, course: Course) -> tuple[Any, Any]:
+    """Positive as long as the orbit is one; and which of these there are."""
+    xp = look.begin.__array_namespace__()
+    index = xp.arange(len(look.begin), dtype=course.num.dtype)
+    last, ends = course.num - 1, xp.asarray(course.ends)
+    real, event = index <= last, ends == EVENT
+    ends_before, ends_after = ends[xp.where(index == 0, last, index - 1)], ends[xp.where(index >= last, 0, index + 1)]
+    values = [-look.rates, look.margins, (look.end - look.begin) / curve.time, look.least.ravel()]
+    there = [
+        real & event & (ends_after != FREE),
+        real & event & xp.isfinite(look.margins),
+        real & (course.num > 1) & (ends != LEAST) & (ends_before != LEAST),
+        (real[:, None] & xp.isfinite(look.least)).ravel(),
+    ]
+    return xp.concatenate(values), xp.concatenate(there)
+
+
+def branch_value(look: Look, log: Any) -> Any:
+    """The determinant of the equations bordered by the tangent, over exp(log)."""
+    sign, size = look.branch
+    xp = sign.__array_namespace__()
+    return sign * xp.exp(xp.clip(size - log, -300, 300))
+
+
+def circle_values(multipliers: Any, autonomous: bool) -> Any:
+    """Zero where a multiplier is -1, and where two have the product 1."""
+    xp = multipliers.__array_namespace__()
+    counts = xp.isfinite(multipliers) & ~(trivial(multipliers) & autonomous)
+    rho = xp.where(counts, multipliers, 0)
+    first, second = xp.triu_indices(len(rho), 1)
+    flip = (1 + rho) / (1 + xp.abs(rho)).astype(rho.dtype)
+    off = xp.where(counts[first] & counts[second], rho[first] * rho[second] - 1, 1)
+    pairs = off / (1 + xp.abs(off)).astype(rho.dtype)
+    return xp.stack([xp.prod(flip), xp.prod(pairs)]).real

@@ -1,0 +1,366 @@
+"""Along a branch of periodic orbits in one course, to the next point at which others may meet it."""
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from ..._numerics._bracket import bracketed
+from ...orbits.segments._equations import OrbitCurve, state_at
+from ...orbits.segments._itinerary import Course
+from ...orbits.segments._point import advance, Look
+from ._test_functions import (
+    BRANCH,
+    branch_value,
+    CIRCLE,
+    circle_values,
+    corner_tests,
+    corner_values,
+    CORNERS,
+    PASSED,
+    Test,
+)
+
+
+FIRST, SHORTEST = 1e-3, 1e-9  # steps, in units of the curve
+UNSEEN = 1e-6  # steps that are not shortened any more for the sake of a branch point
+TURN, TURNED = 0.15, 0.5  # the angles between tangents that are aimed at, and allowed
+NEAR = 1e-5  # zeros that are nearer to each other, in steps, are one
+ON = 1e-11  # an orbit of which a test function is smaller in size is on the corner, on whichever side of it by rounding
+VANISHES = 1e-6  # a test function that is smaller, where another one vanishes
+SAME = 1e-6  # two orbits at one parameter that are nearer are one
+SINGULAR = 1e-3  # the test function of branch points, over its value a step before, where another zero is that of one
+ASIDE = 1e-2  # from a branch point, in steps: a fold that is nearer is the branch point's own
+
+
+@dataclasses.dataclass
+class Spot:
+    """A point of a branch: what is seen there, its course, and its multipliers."""
+
+    look: Look
+    course: Course
+    multipliers: np.ndarray
+    stable: bool
+    monodromy: np.ndarray
+
+    @property
+    def parameter(self) -> float:
+        return float(self.look.parameter)
+
+
+def spot_of(curve: OrbitCurve, look: Look, course: Course) -> Spot:
+    look = jax.device_get(look)
+    return Spot(look, course, look.multipliers, bool(look.stable), look.monodromy)
+
+
+def midpoint(curve: OrbitCurve, spot: Spot, rows: Iterable[int]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Time, state and mode in the middle of the longest of some segments, if possible one that no surface holds: beside
+    it orbits are near each other, as they need not be beside an event or where static friction holds."""
+    look, course = spot.look, spot.course
+    length = {}
+    for i in rows:
+        length[i] = (look.end[i] - look.begin[i]) * (1e-6 if curve.model.holds(course.mode[i]) else 1.0)
+    longest = max(length.values())
+    best = next(i for i in length if length[i] >= longest - 1e-6 * abs(longest))
+    t = np.asarray((look.begin[best] + look.end[best]) / 2)
+    mode = np.asarray(course.mode[best])
+    x = state_at(curve, look.parameter, look.begin[best], t, look.x[best], mode, course.part[best])
+    return float(t), np.asarray(x), mode
+
+
+def told_by(curve: OrbitCurve, spot: Spot, log: float) -> dict[Test, float]:
+    """All test functions of a point; the determinant is divided by exp(log)."""
+    share = float(spot.look.u[-1])
+    ends = {Test("low"): share, Test("high"): 1 - share}
+    smooth = {Test("fold"): float(spot.look.tangent[-1]), BRANCH: float(branch_value(spot.look, log))}
+    return ends | of_corners(curve, spot) | smooth | of_circle(curve, spot)
+
+
+def of_corners(curve: OrbitCurve, spot: Spot) -> dict[Test, float]:
+    values, there = corner_values(curve, spot.look, spot.course)
+    names = corner_tests(*spot.look.least.shape)
+    return {names[i]: float(values[i]) for i in np.flatnonzero(there)}
+
+
+def of_circle(curve: OrbitCurve, spot: Spot) -> dict[Test, float]:
+    return dict(zip(CIRCLE, circle_values(spot.multipliers, curve.autonomous).tolist()))
+
+
+class Zero(NamedTuple):
+    """The zero of a test function: where, what else vanishes there, and on which side of its parameter the branch was
+    before."""
+
+    s: float
+    test: Test
+    spot: Spot
+    others: tuple[Test, ...] = ()
+    side: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Arc:
+    """Points one after the other, up to one at which the course ends. It is a value, from which `OrbitTracer.further`
+    makes the next.
+
+    - `spots`: the points.
+    - `begin`: a point at which it has been all round.
+    - `length`, `steps`: of the next step; how many there were.
+    - `ahead`: points that the last step found, and that are to come: zeros, and where it ends.
+    - `at`: what vanishes at the last point.
+    - `why`, `closed`: why there is no other; whether because it has been all round.
+    """
+
+    spots: tuple[Spot, ...]
+    begin: Spot | None = None
+    length: float = FIRST
+    steps: int = 0
+    ahead: tuple[Spot | Zero, ...] = ()
+    at: Zero | None = None
+    why: str = ""
+    closed: bool = False
+
+    @property
+    def end(self) -> Zero | None:
+        """That with which the course ends."""
+        return None if self.at is None or self.at.test.kind in PASSED else self.at
+
+    @property
+    def over(self) -> bool:
+        return not self.ahead and bool(self.end or self.closed or self.why)
+
+
+@dataclasses.dataclass
+class OrbitTracer:
+    """Traces arcs; virtual ones heed nothing but the ends of the interval."""
+
+    curve: OrbitCurve
+    max_step: float
+    max_points: int
+    virtual: bool = False
+
+    def at(self, spot: Spot, s: float, guess: Any = None) -> Spot | None:
+        """The point at the distance `s` along the tangent of another."""
+        look = spot.look
+        guess = look.u + s * look.tangent if guess is None else guess
+        found = advance(
+            self.curve, spot.course, look.u, look.tangent, np.asarray(s, np.float64), guess, np.asarray(True)
+        )
+        return spot_of(self.curve, found, spot.course) if bool(found.good) else None
+
+    def between(self, a: Spot, b: Spot, value: float) -> Spot | None:
+        """The point between two others at which the parameter has this value."""
+        length = float(a.look.tangent @ (b.look.u - a.look.u))
+        seen = {0.0: a, length: b}
+
+        def at(s: float) -> Spot | None:
+            return self.at(a, s, a.look.u + s / length * (b.look.u - a.look.u))
+
+        try:
+            return seen[bracketed(seen, at, lambda spot: spot.parameter - value)]
+        except (ArithmeticError, ValueError):
+            return None
+
+    def corrected(self, course: Course, guess: Any, border: Any = None) -> Spot | None:
+        """The orbit in a course next to a guess, at the same parameter (or on another plane)."""
+        border = np.eye(len(guess))[-1] if border is None else border
+        found = advance(self.curve, course, guess, border, np.zeros(()), guess, np.asarray(True))
+        return spot_of(self.curve, found, course) if bool(found.good) else None
+
+    def further(self, arc: Arc) -> Arc:
+        """The arc with one point more, or with the reason why there is none."""
+        if not arc.ahead:
+            arc = self.stepped(arc)
+        if not arc.ahead:
+            return arc
+        here, *ahead = arc.ahead
+        zero = here if isinstance(here, Zero) else None
+        spot = here.spot if isinstance(here, Zero) else here
+        return dataclasses.replace(arc, spots=(*arc.spots, spot), ahead=tuple(ahead), at=zero)
+
+    def stepped(self, arc: Arc) -> Arc:
+        """The next step along the tangent at the last point, as long as it can be."""
+        spot, length = arc.spots[-1], arc.length
+        if len(arc.spots) >= self.max_points:
+            return dataclasses.replace(arc, why=f"max_points = {self.max_points}, at {spot.parameter:.10g}")
+        while True:
+            step = self.at(spot, length)
+            turn = np.inf
+            if step is not None:
+                turn = float(np.arccos(np.clip(float(spot.look.tangent @ step.look.tangent), -1, 1)))
+            zeros = self.zeros(spot, step, length) if step is not None and turn <= TURNED else None
+            if step is not None and zeros is not None:
+                break
+            length /= 2
+            if length < SHORTEST:
+                return dataclasses.replace(arc, why=f"the last orbit that could be found, at {spot.parameter:.10g}")
+        zeros = tuple(z for z in zeros if z.test.kind != "Neimark-Sacker" or _complex_pair(z.spot))
+        if zeros and zeros[-1].test.kind not in PASSED:
+            return dataclasses.replace(arc, ahead=zeros)
+        steps = arc.steps + 1
+        if arc.begin is not None and steps > 3 and self.passes(arc.begin, spot, step):
+            return dataclasses.replace(arc, ahead=(*zeros, arc.begin), closed=True)
+        speed = float(np.max(np.abs(step.look.tangent) / np.maximum(1, np.abs(step.look.u))))
+        length = min(self.max_step / speed, length * float(np.clip(TURN / max(turn, 1e-9), 0.5, 2)))
+        return dataclasses.replace(arc, ahead=(*zeros, step), length=length, steps=steps)
+
+    def passes(self, begin: Spot, spot: Spot, step: Spot) -> bool:
+        """Whether another orbit lies on the curve between two points."""
+        value, upwards = begin.parameter, step.parameter > spot.parameter
+        if not min(spot.parameter, step.parameter) <= value < max(spot.parameter, step.parameter):
+            return False
+        if begin.course.key() != spot.course.key() or (begin.look.tangent[-1] > 0) != upwards:
+            return False
+        here = self.between(spot, step, value)
+        return here is not None and alike(here, begin, self.curve, SAME)
+
+    def zeros(self, spot: Spot, step: Spot, length: float) -> list[Zero] | None:
+        """The zeros of test functions between two points, in their order, up to the first at which the course ends;
+        None if the step must be shorter for them to be told."""
+        scale = float(spot.look.branch[1])
+        before, after = (told_by(self.curve, p, scale) for p in (spot, step))
+        changed, found, lost = [], [], []
+        for test, value in before.items():
+            if test not in after or after[test] == 0:
+                continue
+            if test.kind in CORNERS and abs(value) < ON < -after[test] and not self.virtual:
+                found.append(Zero(0.0, test, spot))
+                continue
+            if value * after[test] > 0:
+                continue
+            if self.virtual and test.kind not in ("low", "high"):
+                continue
+            if test.kind in (*CORNERS, "low", "high") and after[test] > 0:
+                continue  # it comes from where it could not be: a start on the point itself
+            changed.append(test)
+        for test in changed:
+            zero = self.located(spot, step, length, test, scale)
+            found += [] if zero is None else [zero]
+            lost += [test] if zero is None else []
+        for test in lost:
+            # Beside a singular point, which another test function may know.
+            small = SINGULAR if test == BRANCH else VANISHES
+            at = next((z for z in found if abs(told_by(self.curve, z.spot, scale).get(test, np.inf)) < small), None)
+            if at is None and (test != BRANCH or length > UNSEEN):
+                return None
+            found += [] if at is None else [at._replace(test=test)]
+        # What turns round at a branch point that it crosses is no fold.
+        branching = [z.s for z in found if z.test == BRANCH]
+        found = [z for z in found if z.test.kind != "fold" or all(abs(z.s - s) > ASIDE * length for s in branching)]
+        found.sort(key=lambda zero: zero.s)
+        near = NEAR * length + 1e-9
+        final = next((z for z in found if z.test.kind not in PASSED), None)
+        if final is not None:
+            # What lies before the end of the course may have changed back beyond it, or at the end itself: it is looked
+            # at a little before that. (At a branch point it may turn.)
+            s, last = self.short_of(spot, final, 2 * near)
+            there = told_by(self.curve, last, scale)
+            for test in (t for t in before if t.kind in PASSED and before[t] * there[t] < 0):
+                if test.kind == "fold" and final.test == BRANCH:
+                    continue
+                if any(z.test == test and z.s <= final.s for z in found):
+                    continue
+                zero = self.located(spot, last, s, test, scale)
+                found += [] if zero is None else [zero]
+            found.sort(key=lambda zero: zero.s)
+        out: list[Zero] = []
+        for zero in found:
+            final = zero.test.kind not in PASSED
+            if final:
+                together = [z for z in found if abs(z.s - zero.s) < near and z is not zero]
+                out.append(self.told(spot, zero, together))
+                break
+            out.append(zero)
+        if out and out[-1].test.kind in (*CORNERS, "branch"):
+            # A test function may pass its zero together with the corner's; it is the corner's then.
+            out = [z for z in out[:-1] if out[-1].s - z.s > near] + out[-1:]
+        return out
+
+    def short_of(self, spot: Spot, zero: Zero, off: float) -> tuple[float, Spot]:
+        """The point so far before a zero on the way from another point; if there is none, the zero."""
+        s = zero.s - off
+        here = None if s <= 0 else self.at(spot, s, spot.look.u + s / zero.s * (zero.spot.look.u - spot.look.u))
+        return (zero.s, zero.spot) if here is None else (s, here)
+
+    def told(self, before: Spot, zero: Zero, together: list[Zero]) -> Zero:
+        """What vanishes at one point, by the first of `CORNERS`."""
+        rank = {kind: i for i, kind in enumerate((*CORNERS, "branch", "low", "high"))}
+        several = sorted([zero, *together], key=lambda z: rank.get(z.test.kind, 99))
+        first = several[0]
+        others = tuple(dict.fromkeys(z.test for z in several[1:]))
+        off = before.parameter - first.spot.parameter
+        side = int(np.sign(off if off else -before.look.tangent[-1]))
+        return first._replace(others=others, side=side)
+
+    def value(self, spot: Spot, test: Test, scale: float) -> float:
+        found = told_by(self.curve, spot, scale).get(test)
+        if found is None:
+            raise ArithmeticError(f"{test} is not a number")
+        return found
+
+    def located(self, spot: Spot, step: Spot, length: float, test: Test, scale: float) -> Zero | None:
+        """By bracketing: the curve is smooth there, and so is the test function but for the least value of a guard."""
+        seen: dict[float, Spot] = {0.0: spot, length: step}
+        chord = step.look.u - spot.look.u
+
+        def at(s: float) -> Spot | None:
+            return self.at(spot, s, spot.look.u + s / length * chord)
+
+        s, rough = None, test.kind == "guard"
+        try:
+            xtol = 1e-5 * length if rough else 1e-14
+            s = bracketed(seen, at, lambda here: self.value(here, test, scale), xtol)
+        except ArithmeticError:
+            pass
+        if s is None or test == BRANCH:
+            # Beside its zero the equations are singular: the last that could be solved tells about where.
+            s = min(
+                (s for s in seen if s > 0), key=lambda s: abs(told_by(self.curve, seen[s], scale).get(test, np.inf))
+            )
+            found = self.interpolated(spot, s, length, chord, scale, test)
+            return None if found is None else Zero(found[0], test, found[1])
+        return Zero(s, test, seen[s])
+
+    def interpolated(
+        self, spot: Spot, s: float, length: float, chord: Any, scale: float, test: Test
+    ) -> tuple[float, Spot] | None:
+        """A point at which the equations are singular, by polynomials through points beside it."""
+        nodes, spots = [], []
+        for share in (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0):
+            node = s + 0.5 * length * share
+            here = self.at(spot, node, spot.look.u + node / length * chord)
+            if here is not None and test in told_by(self.curve, here, scale):
+                nodes.append(share)
+                spots.append(here)
+        if len(nodes) < 4:
+            return None
+        powers = np.vander(nodes, increasing=True)
+        values = [self.value(here, test, scale) for here in spots]
+        roots = np.polynomial.Polynomial(np.linalg.solve(powers, values)).roots()
+        real = [r.real for r in roots if abs(r.imag) < 1e-6 and abs(r) < 1]
+        if not real:
+            return None
+        root = min(real, key=abs)
+        weights = np.linalg.solve(powers.T, root ** np.arange(len(nodes)))
+        u = weights @ np.stack([here.look.u for here in spots])
+        found = advance(self.curve, spot.course, u, spot.look.tangent, np.zeros(()), u, np.asarray(False))
+        return s + 0.5 * length * root, spot_of(self.curve, found, spot.course)
+
+
+def alike(a: Spot, b: Spot, curve: OrbitCurve, tolerance: float) -> bool:
+    """Whether two orbits of one parameter are the same, or one of them the other several times."""
+    sizes = np.asarray(curve.sizes)
+    pairs = ((a.look.mean, b.look.mean, sizes), (a.look.square, b.look.square, sizes**2))
+    return all(float(np.max(np.abs(x - y) / size)) < tolerance for x, y, size in pairs)
+
+
+def turned(spot: Spot) -> Spot:
+    look = spot.look
+    branch = look.branch * np.array([-1, 1])  # the sign of a determinant of which the tangent is a row
+    return dataclasses.replace(spot, look=look._replace(tangent=-look.tangent, branch=branch))
+
+
+def _complex_pair(spot: Spot) -> bool:
+    on = np.abs(np.abs(spot.multipliers) - 1) < 1e-5
+    return bool(np.any(on & (np.abs(np.imag(spot.multipliers)) > 1e-6)))

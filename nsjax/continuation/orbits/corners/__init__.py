@@ -1,0 +1,1 @@
+"""Special points at which the itinerary of an orbit changes."""

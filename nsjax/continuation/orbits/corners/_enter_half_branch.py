@@ -1,0 +1,120 @@
+"""The half-branches that the normal form of a corner foretells, entered next to it."""
+
+import dataclasses
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ....maps._corner_normal_form import CornerMap, Cycle
+from ....orbits.segments._equations import OrbitCurve
+from ....orbits.segments._itinerary import Diary, same_course, Start, starts_from
+from ....orbits.segments._segment_flow import with_parameter
+from .._branch_switching import admissible, Half, together, tracer_for, with_order
+from .._test_functions import PASSED
+from .._tracer import Arc, OrbitTracer, Spot, turned
+from ._grazing import exactly
+from ._return_map import Base, follow, frame
+
+
+DEPARTURES = (1e-4, 1e-5, 1e-3, 1e-6, 1e-7)  # at which a half-branch is entered: of the parameter, in its interval
+PUSHES = (0.0, 1.0, 10.0)  # towards the side of the border where a cycle is, over the square of the distance
+BACK = 40  # points from there to the corner
+NEIGHBOUR = 1e-5  # at which the corner is known again
+
+
+def half_of(tracer: OrbitTracer, spot: Spot, corner: CornerMap, points: list[Base], cycle: Cycle) -> Half | None:
+    """The orbit that a cycle of the normal form foretells, a little way off: piece by piece by the flow, which finds
+    its itinerary, and then corrected."""
+    own = tracer_for(tracer, with_order(tracer.curve, int(tracer.curve.order) * cycle.laps))
+    for departure, push in itertools.product(DEPARTURES, PUSHES if corner.square.any() else PUSHES[:1]):
+        distance = min(departure, 10 * departure / max(1e-12, float(np.abs(cycle.points).max())))
+        away = _pushed(corner, cycle, push * distance)
+        found = _entered(own, spot, points, cycle._replace(points=cycle.points + away), distance)
+        if found is None or not admissible(own.curve, found):
+            continue
+        found = _beside(own, spot, found if float(found.look.tangent[-1]) * cycle.side >= 0 else turned(found))
+        if found is not None:
+            return Half(found, own.curve, cycle.laps, cycle.side, cycle)
+    return None
+
+
+def _pushed(corner: CornerMap, cycle: Cycle, size: float) -> np.ndarray:
+    """A shift of the points by which an event with a square root happens, or does not: where it is taken the distance
+    from the border is of second order, and so is what the normal form leaves out."""
+    places = np.arange(len(cycle.word)) % len(corner.c)
+    toward = np.where(np.array(cycle.word) == 1, -1.0, 1.0) * corner.square[places]
+    return size * toward[:, None] * corner.n[places] * np.max(np.abs(cycle.points)) ** 2
+
+
+def _entered(tracer: OrbitTracer, spot: Spot, points: list[Base], cycle: Cycle, distance: float) -> Spot | None:
+    """Corrected across the way on which the foretold orbits lie: at one parameter there may be none, where the branch
+    turns round next to the corner."""
+    curve = tracer.curve
+    near, far = (_foretold(curve, spot, points, cycle, share * distance) for share in (0.5, 1.0))
+    if near is None or far is None or not same_course(near.course, far.course):
+        return None
+    values = [spot.parameter + cycle.side * share * distance * float(curve.width) for share in (0.5, 1.0)]
+    before, guess = (curve.pack(s.filled(), v) for s, v in zip((near, far), values))
+    return tracer.corrected(far.filled().course, guess, (guess - before) / np.linalg.norm(guess - before))
+
+
+def _beside(tracer: OrbitTracer, at: Spot, found: Spot) -> Spot | None:
+    """The orbit between a corner and whatever else there is on the way to it from an orbit, whose tangent should point
+    away from the corner; None if the way does not come there."""
+    short = dataclasses.replace(tracer, max_points=BACK)
+    for back in (turned(found), found):
+        arc, passed = Arc((back,)), []  # at which points something else is
+        while not arc.over:
+            arc = short.further(arc)
+            if arc.at is not None and arc.at.test.kind in PASSED:
+                passed.append(len(arc.spots) - 1)
+        end = None if arc.end is None else exactly(tracer, arc.end)
+        if end is None or not together(end.spot, at, tracer.curve, NEIGHBOUR):
+            continue
+        if not passed:
+            return turned(back)
+        last, final = arc.spots[-2:]
+        if passed[-1] < len(arc.spots) - 2:
+            return turned(last)
+        way = final.look.u - last.look.u
+        between = tracer.corrected(found.course, last.look.u + way / 2, way / np.linalg.norm(way))
+        return None if between is None else turned(between)
+    return None
+
+
+def _foretold(curve: OrbitCurve, spot: Spot, points: list[Base], cycle: Cycle, distance: float) -> Start | None:
+    m, period = len(points), float(spot.look.period)
+    count = m * cycle.laps
+    sizes = np.asarray(curve.sizes)
+    value = spot.parameter + cycle.side * distance * float(curve.width)
+    off = [frame(curve, spot, points[i % m]) @ cycle.points[i] for i in range(count)]
+    x = np.stack([points[i % m].x + distance * sizes * off[i] for i in range(count)])
+    begin = np.array([points[i % m].t for i in range(count)])
+    end = np.array([points[(i + 1) % m].t + (period if (i + 1) % m == 0 else 0) for i in range(count)])
+    modes = np.stack([points[i % m].mode for i in range(count)]).astype(np.int32)
+    lanes = _filled(x, np.full(count, value), begin, end, modes)
+    xs, values, begins, stops, held = lanes
+    reference = np.asarray(spot.look.parameter)
+    _, _, events, good = jax.device_get(follow(curve, xs, values, reference, begins, stops, held))
+    if not np.all(good[:count]):
+        return None
+    here, there = (with_parameter(curve.model, curve.path, jnp.asarray(v)).system for v in (spot.parameter, value))
+    slow = 1.0 if curve.autonomous else float(there.period) / float(here.period)
+    diaries = []
+    for lane in range(count):
+        diary = Diary.of(jax.tree.map(lambda leaf: leaf[lane], events))
+        diaries.append(diary._replace(t=diary.t + (lane // m) * period * slow))
+    at = begin[0] * slow, cycle.laps * period * slow, modes[0], x[0]
+    diary = functools.reduce(Diary.joined, diaries)
+    if curve.autonomous and len(diary.t):  # time counts from the first event, as on the curve
+        diary = diary._replace(t=diary.t - diary.t[0])
+    return starts_from(curve.model, curve.like, [there], [diary], [at])[0]
+
+
+def _filled(*columns: np.ndarray) -> list[np.ndarray]:
+    """So many lanes that few programs are compiled."""
+    lanes = 16 * -(-len(columns[0]) // 16)
+    return [np.concatenate([c, np.repeat(c[-1:], lanes - len(c), axis=0)]) for c in columns]

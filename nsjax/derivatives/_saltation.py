@@ -1,0 +1,209 @@
+"""Saltation matrices from their formula, an oracle independent of automatic differentiation through the flow."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.flatten_util as jfu
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .._numerics._autodiff import frozen
+from .._types import Scalar, Y
+from ..flow._solution import Events
+from ..flow.events._transition import completed, rebound
+from ..system._model import Model, State
+from ..system._system import arrays_of, clock, impact, relay, System
+
+
+def _float(t: Any, y: Y) -> tuple[Scalar, Y]:
+    dtype = jnp.result_type(float, *jax.tree.leaves(y)) if jax.tree.leaves(y) else jnp.result_type(float)
+    dtype = jnp.result_type(*jax.tree.leaves(y)) if not any(isinstance(x, float) for x in jax.tree.leaves(y)) else dtype
+    return jnp.asarray(t, dtype), jax.tree.map(lambda x: jnp.asarray(x, dtype), y)
+
+
+def _modes(system: System, mode: Any) -> tuple[Int[Array, ""], ...]:
+    names = [k.name for k in system.switches]
+    if isinstance(mode, Mapping):
+        missing = [n for n in names if n not in mode and not isinstance(dict(zip(names, system.switches))[n], impact)]
+        if missing or set(mode) - set(names):
+            raise ValueError(f"A mode must give a value for each of the switches {names}, but got {dict(mode)}.")
+        mode = [mode.get(n, 0) for n in names]
+    elif not isinstance(mode, Sequence) and jnp.ndim(mode) == 0:
+        mode = [mode]
+    if len(mode) != len(names):
+        raise ValueError(f"A mode must give a value for each of the switches {names}, but got {len(mode)} values.")
+    return tuple(jnp.asarray(m, jnp.int32) for m in mode)
+
+
+def states(model: Model, t: Scalar, y: Y, mode: tuple) -> State:
+    """A mode with the component of h that is on its surface: the one nearest to zero."""
+    parts = tuple(
+        None
+        if model.parts[k] == 1 or isinstance(switch, relay)
+        else jnp.argmin(jnp.abs(jnp.stack(model.h(k, t, y)))).astype(jnp.int32)
+        for k, switch in enumerate(model.switches)
+    )
+    return State(mode, parts, tuple(jnp.zeros((), jnp.int32) for _ in mode))
+
+
+def fired(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+    """The guard of switch k that is at zero: its surface, or while sliding the bound that λ has reached."""
+    switch = model.switches[k]
+    mode = state.mode[k]
+    if isinstance(switch, relay):
+        on = switch.guard(model.system, t, y)
+        assert switch.off_guard is not None
+        return jnp.where(mode == 1, switch.off_guard(model.system, t, y), on)
+    if isinstance(switch, clock):
+        return model.span(k, state.mode)[1] - t
+    h = model.h(k, t, y)
+    surface = h[0] if len(h) == 1 else jnp.stack(h)[state.part[k]]
+    if k not in model.holdable:
+        return surface
+    lam = model.values(t, y, state)[k]
+    left = lam if k in model.contacts else model.bound(k) - jnp.sign(lam) * lam
+    return jnp.where(model.held(k, mode), left, surface)
+
+
+def landed(model: Model, k: int, t: Scalar, y: Y, state: State, after: tuple) -> tuple[Y, Scalar]:
+    """The state after an event of switch k at `t`, `y`, and how long the impacts that lead to rest take together."""
+    none = jnp.zeros_like(t)
+    if not isinstance(model.switches[k], impact):
+        return y, none
+    bounced, _ = rebound(model, k, t, y, state)
+    # (Between two ticks: a segment that follows may be the first of the next period.)
+    after = tuple(state.mode[j] if j in model.clocks else m for j, m in enumerate(after))
+    free = jnp.zeros_like(after[k])
+    flight = states(model, t, bounced, after[:k] + (free,) + after[k + 1 :])
+    end = completed(model, k, t, y, bounced, state, flight)
+    lands, rests = state.mode[k] == 0, after[k] == 1  # to lift off is no jump
+    rest = jnp.where(rests, end.rest, 0)
+    held = _held(model, t + rest, end.y, after)
+    out = jax.tree.map(lambda a, b, c: jnp.where(lands, jnp.where(rests, a, b), c), held, bounced, y)
+    return out, jnp.where(lands, rest, none)
+
+
+def _held(model: Model, t: Scalar, y: Y, mode: tuple) -> Y:
+    return model.project(t, y, states(model, t, y, mode))
+
+
+class _Jump(NamedTuple):
+    """An event of one switch, linearised; R is the identity but for impacts."""
+
+    n: Float[Array, " n"]
+    h_t: Scalar
+    f_before: Float[Array, " n"]
+    f_after: Float[Array, " n"]
+    dr: Float[Array, "n n"]  # of R, with respect to the state
+    r_t: Float[Array, " n"]
+    drest: Float[Array, " n"]  # of the time that the impacts up to the state of rest take
+    rest_t: Scalar
+    onto: Float[Array, "n n"]  # the linearised constraints of resting contact
+    blur: tuple[Float[Array, " n"], Float[Array, " n"]]  # what rounding can make of f_before and f_after
+
+
+def _jump(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> _Jump:
+    flat, unravel = jfu.ravel_pytree(y)
+
+    def ravel(y: Y) -> Array:
+        return jfu.ravel_pytree(y)[0]
+
+    state = states(model, t, y, before)
+    h_t, n = jax.jacfwd(lambda t, x: fired(model, k, t, unravel(x), state), argnums=(0, 1))(t, flat)
+    f_before = ravel(model.flow(t, y, state))
+    onto = jnp.eye(flat.size, dtype=flat.dtype)
+
+    def hit(t: Scalar, x: Array) -> tuple[Array, Scalar]:
+        out, rest = landed(model, k, t, unravel(x), state, after)
+        return ravel(out), rest
+
+    (r_t, dr), (rest_t, drest) = jax.jacfwd(hit, argnums=(0, 1))(t, flat)
+    x, rest = hit(t, flat)
+    if isinstance(model.switches[k], impact):
+        rests = (before[k] == 0) & (after[k] == 1)
+        onto = jnp.where(rests, jax.jacfwd(lambda x: ravel(_held(model, t + rest, unravel(x), after)))(x), onto)
+    later = states(model, t, unravel(x), after)
+    f_after = ravel(model.flow(t, unravel(x), later))
+    still, at, begin, end, drift = frozen((model, t, flat, x, jnp.abs(t * f_before)))
+
+    def blur(x: Array, state: State) -> Array:
+        size = unravel(jnp.abs(x) + drift)  # the time, too, is known to rounding only
+        return still.rounding(lambda t, y: ravel(still.flow(t, y, state)), at, unravel(x), size)
+
+    blurs = blur(begin, state) + _part(f_before), blur(end, later) + _part(f_after)
+    return _Jump(n, h_t, f_before, f_after, dr, r_t, drest, rest_t, onto, blurs)
+
+
+def _part(x: Array) -> Array:
+    """What rounding can make of a sum of terms of this size."""
+    return 8 * jnp.finfo(x.dtype).eps * jnp.abs(x)
+
+
+def _unless_rounding(x: Array, blur: Array) -> Array:
+    """Zero where terms cancel, but for their rounding; the derivative stays, as they need not cancel next to it."""
+    return x - lax.stop_gradient(jnp.where(jnp.abs(x) < blur, x, 0))
+
+
+def _matrix(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Float[Array, "n n"]:
+    j = _jump(model, t, y, k, before, after)
+    late = 1 + j.drest @ j.f_before + j.rest_t  # how much later the state of rest begins when the impact does
+    blur = jnp.abs(j.dr) @ j.blur[0] + jnp.abs(late) * j.blur[1] + _part(j.r_t)
+    turn = jnp.outer(_unless_rounding(j.f_after * late - j.dr @ j.f_before - j.r_t, blur), j.n)
+    # At a tangency the matrix is infinite, but what does not depend on the time of the event stays as it is.
+    speed = j.n @ j.f_before + j.h_t
+    none = (turn == 0) & (speed == 0)
+    terms = j.dr, -jnp.outer(j.f_after, j.drest), jnp.where(none, 0, turn / jnp.where(none, 1, speed))
+    size = sum(map(jnp.abs, terms), jnp.zeros_like(turn))
+    jump = _unless_rounding(sum(terms, jnp.zeros_like(turn)), _part(size))
+    if not isinstance(model.switches[k], impact):
+        return jump
+    return _unless_rounding(j.onto @ jump, _part(jnp.abs(j.onto) @ size))
+
+
+def saltation_matrix(
+    system: System, t: Any, y: Y, switch: str, mode_before: Any, mode_after: Any
+) -> Float[Array, "n n"]:
+    """The saltation matrix of an event, by which the fundamental matrix jumps: Φ(t+) = S Φ(t-).
+
+    S = DR + (f⁺ - DR f⁻ - R_t) nᵀ / (nᵀ f⁻ + h_t), with n = grad h: eq. (3.30) where the state does not jump (R = y)
+    and h does not depend on time, (3.32) where it does. At a tangency the denominator vanishes, and the entries that
+    depend on it are infinite. For
+    an impact into resting contact R sums all impacts up to the accumulation point, whose time varies with the state.
+
+    **Arguments:**
+
+    - `system`: the model.
+    - `t`, `y`: time and state at the event, before a jump of the state.
+    - `switch`: the name of the switch whose surface is met, or whose multiplier reaches its bound.
+    - `mode_before`, `mode_after`: the modes, as `{"name": value}`, one value a switch, or for one switch its value.
+
+    **Returns:** the matrix, for the state flattened by `ravel_pytree` (fields of a `NamedTuple` in order), in units of
+    one state component over another.
+
+    **Raises:** `ValueError` for an unknown switch.
+    """
+    names = [k.name for k in system.switches]
+    if switch not in names:
+        raise ValueError(f"Argument `switch` must be one of {', '.join(names) or 'no switches'}, but got {switch!r}.")
+    t, y = _float(t, y)
+    system = arrays_of(system, t.dtype)
+    model = Model(system, jnp.ones_like(t), t, y)
+    before, after = _modes(system, mode_before), _modes(system, mode_after)
+    return _matrix(model, t, y, names.index(switch), before, after)
+
+
+def saltation_matrices(system: System, events: Events) -> Float[Array, "events n n"]:
+    """`saltation_matrix` of every event of a log; rows past the last event are NaN."""
+    dtype = events.t.dtype
+    system = arrays_of(system, dtype)
+    template = jax.tree.map(lambda x: x[0], events.y_before)
+    model = Model(system, jnp.ones((), dtype), jnp.zeros((), dtype), template)
+
+    def one(t: Scalar, y: Y, switch: Array, before: Array, after: Array) -> Array:
+        options = [_matrix(model, t, y, k, tuple(before), tuple(after)) for k in range(len(model.switches))]
+        missing = jnp.full((len(jfu.ravel_pytree(y)[0]),) * 2, jnp.nan, dtype)
+        return jnp.select([switch == k for k in range(len(options))], options, jnp.nan) if options else missing
+
+    return jax.vmap(one)(events.t, events.y_before, events.switch, events.mode_before, events.mode_after)

@@ -1,0 +1,245 @@
+"""Equilibria: in a region, on surfaces that hold them, and virtual ones."""
+
+from typing import Any, Generic
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from .._numerics._autodiff import frozen
+from .._numerics._root import find_root
+from .._numerics._text import listed, shown
+from .._types import Scalar, StateT, Y
+from ..derivatives._floquet import eigenvalues
+from ..flow._results import outcomes, RESULTS
+from ..orbits._orbit import ravel
+from ..system._model import Model, State
+from ..system._system import impact, relay, System
+
+
+@shown
+class Equilibrium(eqx.Module, Generic[StateT]):
+    """A state that does not change.
+
+    **Attributes:**
+
+    - `y`, `mode`: the state, and the mode in which it is one: where this holds it on a surface, a pseudo-equilibrium.
+    - `multipliers`: the values of the switches there: ±1, of a relay 0 or 1, λ of a surface that holds it, the force
+        of a contact.
+    - `jacobian`: ∂f/∂y in this mode, of the field (2.19) on surfaces that hold it; shape `(n, n)`, for the state
+        flattened by `ravel_pytree`.
+    - `eigenvalues`: of what can move, largest real part first: in `n` minus `held` directions, those left out being not
+        numbers.
+    - `held`: how many directions the surfaces take: one each, a contact two.
+    - `stable`: whether all eigenvalues have negative real parts, and the surfaces attract.
+    - `admissible`: whether it lies where its mode does: on its sides of the surfaces, with |λ| within its bound, a
+        contact force that pushes. If not it is virtual.
+    - `boundary`: whether it lies on a surface that does not hold it: there a neighbouring region has it too, and the
+        Jacobian is one-sided.
+    - `isolated`: whether there is no other one nearby. (Sticking friction alone holds in many places.)
+    - `residual`: the largest component of the field.
+    - `result`: `RESULTS`.
+    """
+
+    system: System
+    y: StateT
+    mode: Int[Array, " switches"]
+    multipliers: Float[Array, " switches"]
+    jacobian: Float[Array, "n n"]
+    eigenvalues: Complex[Array, " n"]
+    held: Int[Array, ""]
+    stable: Bool[Array, ""]
+    admissible: Bool[Array, ""]
+    boundary: Bool[Array, ""]
+    isolated: Bool[Array, ""]
+    residual: Scalar
+    result: RESULTS
+
+    def __str__(self) -> str:
+        if jnp.ndim(self.result._value):
+            found = np.asarray(self.result == RESULTS.successful)
+            stable = np.asarray(self.stable)[found]
+            return (
+                f"{found.size} searches for equilibria of {type(self.system).__name__}: {found.sum()} found, "
+                f"{stable.sum()} stable, {(~stable).sum()} unstable"
+            )
+        names = [k.name for k in self.system.switches]
+        where = ", ".join(f"{n} {int(m):+d}" for n, m in zip(names, self.mode)) or "no switches"
+        values = ", ".join(f"{n} {float(v):.6g}" for n, v in zip(names, self.multipliers)) or "none"
+        free = len(self.eigenvalues) - int(self.held)
+        words = ["stable" if self.stable else "unstable"] + ["virtual"] * (not self.admissible)
+        kind = ", ".join(words + ["not isolated"] * (not self.isolated)) + " equilibrium"
+        if self.result != RESULTS.successful:
+            kind = f"failed search ({outcomes(self.result)}) for an equilibrium"
+        return (
+            f"{kind} of {type(self.system).__name__}\n"
+            f"  state        y = ({listed(jfu.ravel_pytree(self.y)[0], 12)})\n"
+            f"  mode         {where}{' (on a surface)' if self.boundary else ''}\n"
+            f"  switches     {values}\n"
+            f"  eigenvalues  {listed(self.eigenvalues[:free])}\n"
+            f"  residual     {float(self.residual):.1e}"
+        )
+
+
+def switch_values(model: Model, t: Scalar, state: State, sigma: Array) -> tuple[Any, ...]:
+    """The value of every switch, for those of the holdable ones."""
+    s = list(model.signs(t, state))
+    for i, k in enumerate(model.holdable):
+        s[k] = sigma[i]
+    return tuple(s)
+
+
+def stacked_values(s: tuple[Any, ...], dtype: Any) -> Float[Array, " switches"]:
+    return jnp.stack([jnp.asarray(v, dtype) for v in s]) if s else jnp.zeros(0, dtype)
+
+
+def balance(model: Model, t: Scalar, y: Y, sigma: Array, state: State) -> Float[Array, " equations"]:
+    """What vanishes at an equilibrium: the field; h on the surfaces that hold it, whose values are unknowns beside the
+    state, (2.19)-(2.20); and what the values of the others differ from their signs."""
+    rest = model.signs(t, state)
+    rows = [
+        jnp.where(model.held(k, state.mode[k]), _surface(model, k, t, y, state), sigma[i] - rest[k])
+        for i, k in enumerate(model.holdable)
+    ]
+    field = ravel(model.field(t, y, switch_values(model, t, state, sigma)))
+    return jnp.concatenate([field, jnp.stack(rows)]) if rows else field
+
+
+@eqx.filter_jit
+def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, max_iterations: int) -> Equilibrium:
+    """Newton's method on f(y, s) = 0 in a given mode, with the values of the surfaces that hold the state as unknowns
+    beside it, and h = 0 there as their equations."""
+    x0, unravel = jfu.ravel_pytree(lax.stop_gradient(y0))
+    model = Model(frozen(system), jnp.ones_like(t), t, y0)
+    holdable = model.holdable
+    state = nearest_state(model, t, y0, mode)
+
+    def residual(z: tuple, system: System) -> Array:
+        return balance(_with(model, system), t, unravel(z[0]), z[1], state)
+
+    # Where a surface holds all along it, the values that keep it there are those of the nearest place.
+    begin, signs = model.values(t, y0, state), model.signs(t, state)
+    sigma = [jnp.where(jnp.isfinite(begin[k]), begin[k], signs[k]) for k in holdable]
+    sigma = jnp.stack(sigma) if sigma else jnp.zeros(0, t.dtype)
+    z, converged = find_root(residual, frozen((x0, sigma)), system, tol, max_iterations, well_posed=False)
+    still = frozen(z)
+    error = jnp.max(jnp.abs(residual(still, frozen(system))))
+    whole = jax.jacfwd(lambda z: residual(jfu.ravel_pytree(still)[1](z), frozen(system)))
+    singular = jnp.linalg.svd(whole(jfu.ravel_pytree(still)[0]), compute_uv=False)
+    isolated = singular[-1] > 1e-10 * singular[0]
+
+    live = _with(model, system)
+    y, s = unravel(z[0]), switch_values(live, t, state, z[1])
+    jacobian, motion, held, attracts = linear_motion(live, t, y, state, s)
+    roots = free_eigenvalues(motion, held)
+    admissible, boundary = _place(model, t, frozen(y), state, frozen(s))
+    size = 1 + jnp.max(jnp.abs(z[0]))
+    good = converged & (error <= 1e3 * tol * size)
+    return Equilibrium(
+        system=system,
+        y=y,
+        mode=jnp.stack(state.mode) if state.mode else jnp.zeros(0, jnp.int32),
+        multipliers=stacked_values(s, t.dtype),
+        jacobian=jacobian,
+        eigenvalues=roots,
+        held=held,
+        stable=all_decay(roots, held) & attracts,
+        admissible=admissible,
+        boundary=boundary,
+        isolated=isolated,
+        residual=error,
+        result=RESULTS.where(good, RESULTS.successful, RESULTS.equilibrium_not_found),
+    )
+
+
+def _with(model: Model, system: System) -> Model:
+    return eqx.tree_at(lambda m: m.system, model, system)
+
+
+def nearest_state(model: Model, t: Scalar, y: Y, mode: tuple) -> State:
+    """The mode, with the component of h nearest to zero where h < 0 or on it, and its least one elsewhere."""
+    parts = []
+    for k, switch in enumerate(model.switches):
+        one = model.parts[k] == 1 or isinstance(switch, relay)
+        parts.append(None if one else jnp.argmin(jnp.stack(model.h(k, t, y))).astype(jnp.int32))
+    return State(mode, tuple(parts), tuple(jnp.zeros((), jnp.int32) for _ in mode))
+
+
+def _surface(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+    h = jnp.stack(model.h(k, t, y))
+    return h[0 if state.part[k] is None else state.part[k]]
+
+
+def linear_motion(
+    model: Model, t: Scalar, y: Y, state: State, s: tuple
+) -> tuple[Float[Array, "n n"], Float[Array, "n n"], Int[Array, ""], Bool[Array, ""]]:
+    """The Jacobian; the same with rates for the directions off the surfaces that hold the state which are far left of
+    all others; how many these are; and whether the surfaces attract (2.24)."""
+    x, unravel = jfu.ravel_pytree(y)
+    jacobian = jax.jacfwd(lambda x: ravel(model.flow(t, unravel(x), state)))(x)
+    held, attracts = jnp.zeros((), jnp.int32), jnp.ones((), bool)
+    normals, taken = [], []
+    for k in model.holdable:
+        on = model.held(k, state.mode[k])
+        contact = k in model.contacts
+        held = held + jnp.where(on, 2 if contact else 1, 0)
+        gradients = [jax.grad(lambda x, k=k: model.level(k, t, unravel(x), state))(x)]
+        if contact:
+            gradients.append(jax.grad(lambda x, k=k: _surface(model, k, t, unravel(x), state))(x))
+        else:
+            slope = jax.jacfwd(lambda v, k=k: model.rates((k,), t, y, state, s[:k] + (v,) + s[k + 1 :])[0])(s[k])
+            attracts = attracts & jnp.where(on, slope < 0, True)
+        normals += [jnp.where(on, g / jnp.linalg.norm(g), 0) for g in gradients]
+        taken += [on] * len(gradients)
+    if not normals:
+        return jacobian, jacobian, held, attracts
+    # The normals N span a left invariant subspace, N J = T N: that is what being held means. So J - N⁺ (T + D) N has
+    # -D for T, and the other eigenvalues of J.
+    normal, on = jnp.stack(normals), jnp.stack(taken)
+    inverse = normal.T @ jnp.linalg.inv(normal @ normal.T + jnp.diag(jnp.where(on, 0, 1).astype(x.dtype)))
+    far = 10 * (1 + jnp.max(jnp.abs(lax.stop_gradient(jacobian)))) * len(x)
+    rates = jnp.diag(far * (1 + jnp.arange(len(normals), dtype=x.dtype)))
+    return jacobian, jacobian - inverse @ (normal @ jacobian @ inverse + rates) @ normal, held, attracts
+
+
+def free_eigenvalues(motion: Float[Array, "n n"], held: Int[Array, ""]) -> Complex[Array, " n"]:
+    """Largest real part first; those off the surfaces come last, and are not numbers."""
+    roots = eigenvalues(motion)
+    order = jnp.argsort(-lax.stop_gradient(roots).real)
+    return jnp.where(_free(len(roots), held), roots[order], jnp.nan)
+
+
+def all_decay(roots: Complex[Array, " n"], held: Int[Array, ""]) -> Bool[Array, ""]:
+    """Whether the eigenvalues of what can move have negative real parts."""
+    return jnp.all(jnp.where(_free(len(roots), held), roots.real < 0, True))
+
+
+def _free(n: int, held: Int[Array, ""]) -> Bool[Array, " n"]:
+    return jnp.arange(n, dtype=held.dtype) < n - held
+
+
+def _place(model: Model, t: Scalar, y: Y, state: State, s: tuple) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether the state lies where its mode does, and whether on a surface that does not hold it."""
+    admissible, boundary = jnp.ones((), bool), jnp.zeros((), bool)
+    for k, switch in enumerate(model.switches):
+        mode = state.mode[k]
+        if isinstance(switch, relay):
+            on, off = switch.guard(model.system, t, y), switch.off_guard(model.system, t, y)
+            admissible = admissible & (jnp.where(mode == 1, off, on) <= 0)
+            continue
+        parts = jnp.stack(model.h(k, t, y))
+        h, slack = jnp.min(parts), 1e3 * jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y)) + 1e-9
+        on = jnp.abs(h) <= slack
+        side = (h >= -slack) if isinstance(switch, impact) else (mode.astype(h.dtype) * h >= -slack)
+        if k not in model.holdable:
+            admissible, boundary = admissible & side, boundary | on
+            continue
+        held = model.held(k, mode)
+        within = s[k] >= -1e-9 if k in model.contacts else jnp.abs(s[k]) <= model.bound(k) * (1 + 1e-9)
+        admissible = admissible & jnp.where(held, within & (h >= -slack), side)
+        boundary = boundary | (on & ~held)
+    return admissible, boundary

@@ -1,0 +1,170 @@
+"""The search for equilibria."""
+
+import itertools
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+
+from .._numerics._jaxpr import is_constant
+from .._types import StateT, Y
+from ..flow._arguments import check_solve
+from ..flow._results import raise_if, RESULTS
+from ..orbits._orbit import ravel
+from ..system._model import Model
+from ..system._system import arrays_of, clock, impact, sgn, System
+from ._equilibrium import Equilibrium, equilibrium_in
+
+
+MODES = 729  # so many modes at most are tried one by one
+
+
+def find_equilibrium(
+    system: System,
+    y0: StateT,
+    *,
+    mode: Any = None,
+    t: Any = 0.0,
+    tol: float | None = None,
+    max_iterations: int = 50,
+    throw: bool = True,
+) -> Equilibrium[StateT]:
+    """Finds an equilibrium by optimistix's Newton method: f(t, y, s) = 0 in a mode, on surfaces that hold it with their
+    multipliers λ as unknowns beside the state (2.19)-(2.20).
+
+    Its state, multipliers and eigenvalues are differentiable with respect to the parameters of `system`, by implicit
+    differentiation.
+
+    **Arguments:**
+
+    - `system`: an autonomous model (or one that time does not enter at the forces).
+    - `y0`: a guess.
+    - `mode`: where to look, as `{"name": value}`, one value for each switch, or for one switch its value: `sgn` +1, -1
+        or 0 for a state on the surface that it holds; `relay` 0 or 1; `impact` 1 for a resting contact. By default the
+        mode of `y0`; and, if what is found from there is virtual, the admissible one of another mode that is nearest
+        to `y0` (this needs concrete values: not under `jit` or `vmap`).
+    - `t`: the time at which forces are taken.
+    - `tol`: tolerance of Newton's method, by default 1e-12 (float32: 1e-5).
+    - `throw`: whether a failure raises; if not, look at `Equilibrium.result`.
+
+    **Returns:** an `Equilibrium`, which may be a virtual one: see `admissible`.
+
+    **Raises:** `ValueError` for a model that time enters; a runtime error if Newton's method does not converge.
+    """
+    system, y0, t, given, tol = checked_equilibrium(system, y0, t, mode, tol)
+    model = Model(system, jnp.ones_like(t), t, y0)
+    names = [k.name for k in system.switches]
+    chosen = tuple(given.get(n, m) for n, m in zip(names, _mode_of(model, t, y0)))
+    found = equilibrium_in(system, t, y0, chosen, tol, max_iterations)
+    concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, y0)))
+    if concrete and len(given) < len(names) and not (found.result == RESULTS.successful and found.admissible):
+        others = _in_all_modes(system, model, t, jax.tree.map(lambda x: x[None], y0), given, tol, max_iterations)
+        others = [other for other in others if other.admissible]
+        if others:
+            found = min(others, key=lambda other: float(jnp.linalg.norm(ravel(other.y) - ravel(y0))))
+    if throw:
+        found = raise_if(found.result != RESULTS.successful, found.result, found)
+    return found
+
+
+def find_equilibria(
+    system: System,
+    starts: StateT,
+    *,
+    mode: Any = None,
+    virtual: bool = False,
+    t: Any = 0.0,
+    tol: float | None = None,
+    max_iterations: int = 50,
+) -> list[Equilibrium[StateT]]:
+    """The different equilibria that Newton's method finds from many starting points in every mode.
+
+    **Arguments:**
+
+    - `system`, `t`, `tol`: as for `find_equilibrium`.
+    - `starts`: states to start from, leaves with a leading axis.
+    - `mode`: modes of some or all switches, if only these are wanted.
+    - `virtual`: whether virtual ones are wanted too.
+
+    **Returns:** the equilibria, admissible ones first; those that share a state (on a surface that does not hold it)
+    are one. Of a continuum, as sticking friction makes, those nearest to the starts.
+
+    **Raises:** `ValueError` for more than 729 modes: give some by `mode`.
+    """
+    first = jax.tree.map(lambda x: jnp.asarray(x)[0], starts)
+    system, first, t, given, tol = checked_equilibrium(system, first, t, mode, tol)
+    starts = jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), starts, first)
+    model = Model(system, jnp.ones_like(t), t, first)
+    found = _in_all_modes(system, model, t, starts, given, tol, max_iterations)
+    distinct: list[Equilibrium] = []
+    for one in sorted(found, key=lambda one: (not one.admissible, bool(one.boundary))):
+        size = 1 + float(jnp.max(jnp.abs(ravel(one.y))))
+        same = any(jnp.max(jnp.abs(ravel(one.y) - ravel(other.y))) <= 1e-8 * size for other in distinct)
+        if not same and (virtual or one.admissible):
+            distinct.append(one)
+    return distinct
+
+
+def checked_equilibrium(system: System, y0: Y, t: Any, mode: Any, tol: float | None) -> tuple:
+    y0, t, _, _, _, given = check_solve(system, t, t, y0, mode, dfx.Dopri8(), None, dfx.SaveAt(t1=True), 1, 1, None)
+    system = arrays_of(system, t.dtype)
+    values = system.values(tuple(jnp.zeros((), t.dtype) for _ in system.switches))
+    ticks = any(isinstance(switch, clock) for switch in system.switches)
+    if ticks or not is_constant(lambda t: system.vector_field(t, y0, values), t):
+        raise ValueError(
+            f"`{type(system).__name__}` has no equilibrium, as time enters its vector field: look for a periodic orbit "
+            "by `find_orbit`, or leave the forcing out of the model."
+        )
+    return system, y0, t, given, (1e-12 if jnp.finfo(t.dtype).eps < 1e-10 else 1e-5) if tol is None else tol
+
+
+def _options(model: Model, given: dict[str, Any]) -> list[tuple[int, ...]]:
+    """The modes that each switch may have."""
+    options = []
+    for k, switch in enumerate(model.switches):
+        free = (-1, 1) if isinstance(switch, sgn) else (0, 1)
+        if isinstance(switch, sgn) and k in model.holdable:
+            free = (-1, 0, 1)
+        elif isinstance(switch, impact) and k not in model.contacts:
+            free = (0,)
+        options.append((int(given[switch.name]),) if switch.name in given else free)
+    return options
+
+
+def _mode_of(model: Model, t: Any, y: Y) -> list[Any]:
+    """By the signs of h; what lies on a surface that can hold it counts as held."""
+    modes = []
+    for k, switch in enumerate(model.switches):
+        if isinstance(switch, sgn):
+            h = jnp.min(jnp.stack(model.h(k, t, y)))
+            noise = jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y))
+            on = 0 if k in model.holdable else 1
+            modes.append(jnp.where(jnp.abs(h) <= noise, on, jnp.sign(h)).astype(jnp.int32))
+        else:
+            modes.append(jnp.zeros((), jnp.int32))
+    return modes
+
+
+def _in_all_modes(
+    system: System, model: Model, t: Any, starts: Y, given: dict[str, Any], tol: float, max_iterations: int
+) -> list[Equilibrium]:
+    """What Newton's method finds from every start in every mode."""
+    table = list(itertools.product(*_options(model, given)))
+    if len(table) > MODES:
+        raise ValueError(f"Argument `mode` must leave at most {MODES} modes to be tried, but leaves {len(table)}.")
+    number = len(jax.tree.leaves(starts)[0])
+    modes = tuple(jnp.tile(jnp.asarray(column, jnp.int32), number) for column in zip(*table))
+    lanes = jax.tree.map(lambda x: jnp.repeat(x, len(table), axis=0), starts)
+    batch = _batch(system, t, lanes, modes, tol, max_iterations)
+    arrays, static = eqx.partition(batch, eqx.is_array)
+    good = np.flatnonzero(np.asarray(batch.result == RESULTS.successful))
+    return [eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static) for i in good]
+
+
+@eqx.filter_jit
+def _batch(system: System, t: Any, starts: Y, modes: tuple, tol: float, max_iterations: int) -> Equilibrium:
+    return jax.vmap(lambda y, mode: equilibrium_in(system, t, y, mode, tol, max_iterations))(starts, modes)

@@ -1,0 +1,104 @@
+"""What a failed solution is told as: one line with the cause, the place and the remedy.
+
+Where the numbers are known this is raised in Python, after the compiled program has ended. (An error raised within one
+comes with the stack of the compiler, and may be that of an earlier call.)
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._numerics._text import components, written
+from .._types import Y
+from ..system._checks import closing_contacts
+from ..system._model import Model, State
+from ..system._system import clock, impact, relay
+from ._results import RESULTS
+from ._solution import Solution
+
+
+def explain(system: Any, sol: Solution) -> str:
+    """Why a solution failed, in one line."""
+    text, result = str(RESULTS[sol.result]), sol.result
+    where = f"t = {float(sol.t1):.10g}, {written(sol.y1)}"
+    if result == RESULTS.nonfinite_field:
+        what = _not_finite(system, sol)
+        text = f"{what} at {where}." if what else f"{text[:-1]} next to {where}."
+    elif result == RESULTS.dt_min_reached:
+        largest = max(abs(float(value)) for _, value in components(sol.y1))
+        cause = (
+            "the solution grows beyond all bounds there (a finite-time blow-up)"
+            if largest > 1e6
+            else "it cannot be resolved to the tolerances (they are too small, or the field is singular or jumps there)"
+        )
+        text = f"The steps became too small at {where}: {cause}."
+    elif result == RESULTS.wrong_contact:
+        model = Model(system, jnp.ones_like(sol.t1), sol.t1, sol.y1)
+        closes = closing_contacts(model.at(sol.t1), sol.t1, sol.y1)
+        name = next((model.switches[k].name for k, bad in closes.items() if bad), "name")
+        text = (
+            f"`{type(system).__name__}.vector_field` must contain `s.{name}` with the sign with which a contact force "
+            f"s.{name} >= 0 opens the gap `{name}`, but it closes it. Change its sign."
+        )
+    elif result == RESULTS.jump_in_time:
+        text = f"{_jumping(system, sol)} at {where}. {text.partition(') ')[2] or text}"
+    else:
+        text = f"{text} (At {where}.)"
+    return " ".join(text.split())
+
+
+def _pieces(system: Any, t: Any, y: Y, mode: Any) -> list[tuple[str, list[tuple[str, Any]]]]:
+    """What the model's methods return, named."""
+    owner, out = type(system).__name__, []
+    model = Model(system, jnp.ones_like(t), t, y)
+    zero = jnp.zeros((), jnp.int32)
+    parts = tuple(zero if n > 1 else None for n in model.parts)
+    state = State(tuple(mode), parts, tuple(zero for _ in model.switches))
+    model = model.within(state.mode)
+    for k, switch in enumerate(model.switches):
+        if isinstance(switch, clock):
+            continue
+        if isinstance(switch, relay):
+            h = switch.guard(system, model.time(t), y), switch.off_guard(system, model.time(t), y)
+        else:
+            h = model.h(k, t, y)
+        out.append((f"`{owner}.{switch.name}`", [("h", value) for value in h]))
+    signs = tuple(
+        x if isinstance(switch, impact) else jnp.where(x == 0, 1, x)
+        for switch, x in zip(model.switches, model.signs(t, state))
+    )
+    return [*out, (f"`{owner}.vector_field`", components(model.field(t, y, signs)))]
+
+
+def _not_finite(system: Any, sol: Solution) -> str | None:
+    """Which function of the model returned a number that is not finite."""
+    for name, value in components(sol.y1):
+        if not np.isfinite(value):
+            return f"The state ceased to be finite ({name} = {float(value)}: it overflows, or the model returned NaN)"
+    for name, values in _pieces(system, sol.t1, sol.y1, sol.mode1):
+        for part, value in values:
+            if not np.isfinite(value):
+                which = "" if part == "h" else f" for `{part}`"
+                return f"{name} returned {float(value)}{which}"
+    return None
+
+
+def _jumping(system: Any, sol: Solution) -> str:
+    """Which indicator function jumps within the step that failed."""
+    span = abs(float(sol.t1 - sol.t0)) + abs(float(sol.t1))
+    ahead = sol.t1 + 1e-6 * span * jnp.where(sol.t1 >= sol.t0, 1, -1)
+    slope = dict(_pieces(system, sol.t1, sol.y1, sol.mode1))[f"`{type(system).__name__}.vector_field`"]
+    leaves, tree = jax.tree.flatten(sol.y1)
+    if all(jnp.ndim(leaf) == 0 for leaf in leaves):
+        rates = jnp.asarray([value for _, value in slope])
+        leaves = [leaf + (ahead - sol.t1) * rate for leaf, rate in zip(leaves, rates)]
+    here, there = (
+        _pieces(system, t, y, sol.mode1) for t, y in ((sol.t1, sol.y1), (ahead, jax.tree.unflatten(tree, leaves)))
+    )
+    jumps = [
+        (max(abs(float(b) - float(a)) for (_, a), (_, b) in zip(before, after)), name)
+        for (name, before), (_, after) in zip(here[:-1], there)
+    ]
+    return f"{max(jumps)[1]} jumps"

@@ -1,0 +1,392 @@
+"""One turn of the flow's loop: a step of a diffrax solver, or the work at an event.
+
+Under `vmap` every lane is in its own mode and at its own time: it takes a step, or works on its event, and never waits
+for the segments of the others.
+"""
+
+import functools as ft
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, PyTree
+
+from .._numerics._autodiff import frozen
+from .._numerics._barrier import once
+from .._numerics._lane_cond import compact_cond
+from .._types import Scalar, Y
+from ..system._model import BEYOND, Model, State
+from ..system._system import impact
+from ._results import RESULTS
+from ._save import Log, Saved
+from .events._attraction import escapes
+from .events._transition import land, Landing
+from .steppers._stepper import stack, Step, Stepper, unresolved, Watch
+
+
+class Carry(eqx.Module):
+    """What one turn of the loop hands to the next."""
+
+    t: Scalar
+    y: Y
+    f: Y  # the field at (t, y)
+    state: State
+    dt: Scalar
+    controller: PyTree
+    active: Bool[Array, ""]
+    result: RESULTS
+    steps: Int[Array, ""]
+    accepted: Int[Array, ""]
+    events: Int[Array, ""]
+    halted: Int[Array, ""]  # events in a row without progress in time
+    halvings: Int[Array, ""]  # in a row, to resolve a guard
+    crawled: Int[Array, ""]  # steps in a row of a few units in the last place of time
+    grazed: Bool[Array, ""]  # whether an event was tangential
+    forked: Bool[Array, ""]  # whether another solution sets out from the start too, or branches off on the way
+    margin: Scalar  # the nearest that a guard came to zero without meeting it
+    log: Log | None
+    saved: Saved
+    meter: PyTree
+
+
+class _Attempt(NamedTuple):
+    """A step of the solver, before it is known whether an event cuts it short."""
+
+    step: Step
+    keep: Bool[Array, ""]  # whether it is accepted
+    dt: Scalar  # length of the next
+    halvings: Int[Array, ""]
+    controller: PyTree
+    result: RESULTS
+    busy: Bool[Array, ""]  # whether one of them may have a root
+    touches: list[list[Bool[Array, ""]]]  # `[slot][part]`: whether it has one at the end of the solution
+
+
+class Flow(eqx.Module):
+    """One solve: the model, the method, and the body of its loop."""
+
+    model: Model
+    stepper: Stepper
+    controller: dfx.AbstractStepSizeController
+    t0: Scalar
+    t1: Scalar
+    max_steps: int = eqx.field(static=True)
+    max_events: int = eqx.field(static=True)
+    keep_steps: int = eqx.field(static=True)  # every so many steps are saved
+    want_points: bool = eqx.field(static=True)
+    meter: dfx.AbstractProgressMeter
+    affine: tuple[bool, ...] = eqx.field(static=True)  # whether each guard is affine in (t, y)
+    jumpy: tuple[bool, ...] = eqx.field(static=True)  # whether each guard holds an operation that may jump
+    reverse: bool = eqx.field(static=True)  # whether the loop is to be transposed
+
+    @property
+    def tolerance(self) -> tuple[Any, Any]:
+        """Relative and absolute, of a step; not numbers for steps of a given length."""
+        return getattr(self.controller, "rtol", jnp.nan), getattr(self.controller, "atol", jnp.nan)
+
+    def land(
+        self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list, noise: list, touches: list
+    ) -> Landing:
+        """The step once more, to its first event."""
+        model = self.model.within(state.mode)
+        *first, last = once(self.stepper.scaled(model, lax.stop_gradient(coefficients)))
+        polynomials = [*first, jnp.where(model.stacked(touches, False), jnp.minimum(last, 0), last)]
+        noises = model.stacked(lax.stop_gradient(noise), 0.0)
+        return land(
+            model, self.stepper, self.tolerance, self.want_points, self.t0, t, t_next, y, f, state, polynomials, noises
+        )
+
+    def attempt(self, c: Carry) -> _Attempt:
+        """A step of the solver, its error against the tolerance, and whether a guard may have a root on it."""
+        model, stepper = self.model.within(c.state.mode), self.stepper
+
+        t_next = jnp.where(c.t + c.dt >= self.t1, self.t1, c.t + c.dt)
+        tick = model.next_tick(c.state.mode) if model.clocks else jnp.inf
+        if model.clocks:
+            t_next = jnp.minimum(t_next, jnp.maximum(tick, c.t))
+        step = stepper(model, c.state, c.t, t_next, c.y, c.f, Watch(self.affine, self.controller))
+        t_next = step.t_next
+        keep, dt, controller, outcome = self.pace(c, step)
+        halvings, result, touches = c.halvings, RESULTS.promote(outcome), []
+        if step.fits is not True:
+            result = RESULTS.where(step.fits, result, RESULTS.mode_not_affine)
+        busy = jnp.zeros((), bool)
+        if model.slots:
+            known, touches = model.known_roots(c.state), self.touches(c, step)
+            low = self.survey(step.guards, known)
+            is_finite, quiet = low == low, low > 0
+            result = RESULTS.where(keep & ~is_finite, RESULTS.nonfinite_field, result)
+            # A guard that is no polynomial to the precision needed is not trusted: a shorter step is. (At most so
+            # often: one with a kink never is.)
+            # Nor is a step so short that rounding of time alone spoils the polynomial.
+            eps = float(jnp.finfo(c.t.dtype).eps)
+            floor = 4 * eps / unresolved(c.t.dtype) * jnp.maximum(jnp.abs(c.t), self.t1 - self.t0)
+            poor = ~step.resolved | _backward(step, known)
+            poor, last = poor & keep & is_finite, (halvings >= 30) | (t_next - c.t <= floor)
+            if any(self.jumpy):
+                leaps = poor & last & self.leaps(model, c, step)
+                result, keep = RESULTS.where(leaps, RESULTS.jump_in_time, result), keep & ~leaps
+            poor = poor & ~last
+            halvings = jnp.where(poor, halvings + 1, jnp.where(keep, 0, halvings))
+            keep = keep & ~poor
+            dt = jnp.where(poor, 0.5 * (t_next - c.t), dt)
+            # On the last few ulps before the end the polynomials are rounding.
+            ahead = t_next - c.t > 4 * eps * jnp.abs(c.t)
+            if model.clocks:
+                ahead = ahead | (t_next >= tick)
+                # A step cut short by a tick says nothing against a longer one.
+                dt = jnp.where(keep & (t_next >= tick), jnp.maximum(dt, c.dt), dt)
+            touching = ft.reduce(jnp.logical_or, [part for row in touches for part in row])
+            busy = c.active & keep & is_finite & ((~quiet & ahead) | touching)
+        if self.reverse:
+            # The derivatives of a rejected step that overflows are no numbers, and zero times that is none either.
+            again = stepper(model, c.state, c.t, jnp.where(keep, t_next, c.t), c.y, c.f)
+            step = step._replace(t_next=again.t_next, y1=again.y1, ks=again.ks, slope=again.slope)
+        return _Attempt(step, keep & c.active, dt, halvings, controller, result, busy, touches)
+
+    def touches(self, c: Carry, step: Step) -> list[list[Bool[Array, ""]]]:
+        """Which guards fall to zero at the very end of the solution, apart from rounding of the time, of the step
+        (whose weights are numbers of some tens), or of their own; and the ticks at which the step ends. (The time that
+        is left until a tick is not zero there if a product and a difference are rounded as one.)"""
+        length = frozen(step.t_next) - frozen(c.t)
+        eps = float(jnp.finfo(length.dtype).eps)
+        far = 4 * eps * jnp.abs(frozen(step.t_next)) / jnp.where(length > 0, length, 1) + 32 * eps
+
+        def touches(c: list[Scalar], noise: Scalar) -> Bool[Array, ""]:
+            value, slope = self.stepper.end(c)
+            return (value > 0) & (slope < 0) & (value + far * slope <= noise)
+
+        final = (step.t_next >= self.t1) & (length > 0)
+        pairs = [zip(*rows) for rows in zip(frozen(step.guards), frozen(step.noise))]
+        rows = [[final & touches(c, noise) for c, noise in row] for row in pairs]
+        for i, slot in enumerate(self.model.slots):
+            if slot.switch in self.model.clocks:
+                tick = frozen(self.model.tick(slot.switch, c.state.mode))
+                rows[i] = [step.t_next >= tick - 4 * eps * jnp.abs(tick)]
+        return rows
+
+    def pace(self, c: Carry, step: Step) -> tuple[Any, Any, PyTree, Any]:
+        """Whether a step is accurate enough, the length of the next, and the controller's state and verdict."""
+        model, t, t_next = self.model.within(c.state.mode), *frozen((c.t, step.t_next))
+        own = self.stepper.pace(self.controller, frozen(step), t, frozen(c.y), self.t1 - self.t0)
+        if own is not None:
+            return *own, c.controller, dfx.RESULTS.successful
+        # An error that is not a number is too large.
+        error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), step.error)
+        terms = dfx.ODETerm(lambda t, y, args: model.flow(t, y, c.state))
+        # The step size is no function to be differentiated; powers of an error of zero are not even differentiable.
+        y, y1, error = frozen((c.y, step.y1, error))
+        # A step that overflows is too long, but must not make the next one infinity divided by infinity.
+        y1 = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), y1, y)
+        order = self.stepper.solver.error_order(terms)
+        keep, a, b, _, controller, outcome = self.controller.adapt_step_size(
+            t, t_next, y, y1, None, error, order, c.controller
+        )
+        return keep, b - a, controller, outcome
+
+    def leaps(self, model: Model, c: Carry, step: Step) -> Bool[Array, ""]:
+        """Whether a guard that no step is short enough to resolve jumps: changes by far more than its derivatives at
+        both ends of the step make it, and rounding. (One with a kink does not.)"""
+        change = jax.tree.map(lambda a, b, f: jnp.abs(b - a) + jnp.abs(f * (step.t_next - c.t)), c.y, step.y1, c.f)
+        found = jnp.zeros((), bool)
+        for i in [i for i, jumps in enumerate(self.jumpy) if jumps]:
+            wanted = tuple(j == i for j in range(len(self.jumpy)))
+
+            def guard(t: Scalar, y: Y, i: int = i, wanted: tuple[bool, ...] = wanted) -> list[Scalar]:
+                return model.guards(t, y, c.state, wanted)[i]
+
+            ends = [(c.t, c.y), (step.t_next, step.y1)]
+            before, after = (jnp.stack(guard(*end)) for end in ends)
+            smooth = [model.sizes(guard, *end, step.t_next - c.t, change) + model.rounding(guard, *end) for end in ends]
+            found = found | jnp.any(jnp.abs(after - before) > 1e3 * (smooth[0] + smooth[1]))
+        return lax.stop_gradient(found)
+
+    def survey(self, guards: list, known: list) -> Scalar:
+        """A lower bound of the guards along the step, leaving out their known roots; not a number if any coefficient is
+        not finite. Where it is positive no guard has a root: one of its parts is positive all along."""
+        rows = [ft.reduce(jnp.maximum, map(self.stepper.least, row, roots)) for row, roots in zip(guards, known)]
+        return once(ft.reduce(jnp.minimum, rows) + 0 * sum(c for row in guards for part in row for c in part))
+
+    def arrive(self, c: Carry, attempt: _Attempt) -> Landing:
+        """Where the step leads: to its end, or to the first event on it."""
+        model = self.model.within(c.state.mode)
+        step = attempt.step
+        t, no = step.t_next, jnp.zeros((), bool)
+        y_end = model.project(t, step.y1, c.state)
+        points = stack(self.stepper.points(c.y, step.y1, step.ks)) if self.want_points else None
+        end = Landing(
+            found=no,
+            t=t,
+            t_after=t,
+            y_before=step.y1,
+            y_after=y_end,
+            f_after=model.flow(t, y_end, c.state) if step.slope is None else step.slope,
+            state=c.state,
+            slot=jnp.zeros((), jnp.int32),
+            news=no,
+            points=points,
+            transversality=jnp.ones_like(t),
+            grazes=no,
+            # Beyond a two-fold, which is no event: its multiplier is 0/0.
+            forked=no if model.steady else escapes(model, t, y_end, c.state),
+            result=RESULTS.successful,
+            margin=jnp.full_like(t, jnp.inf),
+        )
+        if not model.slots:
+            return end
+        here = (c.t, t, c.y, c.f, c.state, lax.stop_gradient(step.guards), lax.stop_gradient(step.noise))
+        here = (*here, attempt.touches)
+        there = _landed(attempt.busy, self, here, end)
+        # A lane that looked for a root may have found none.
+        event = attempt.busy & there.found
+        near = jnp.where(attempt.busy, there.margin, jnp.inf)
+        there = jax.tree.map(lambda a, b: jnp.where(event, a, b), there, end)._replace(margin=near)
+        roots = list(there.state.roots)
+        for k, r in enumerate(roots):
+            later = jnp.where(jnp.abs(r) >= BEYOND, jnp.sign(r) * BEYOND, 0) if model.static(k) else 0
+            roots[k] = jnp.where(event, r, later)
+        return there._replace(state=there.state._replace(roots=tuple(roots)))
+
+    def body(self, c: Carry) -> Carry:
+        model = self.model
+        step = self.attempt(c)
+        there = self.arrive(c, step)
+        event, result = there.found, step.result
+        # What happened to this lane: an event, an accepted step, a rejected one, or nothing as it has ended.
+        moved = step.keep | event
+        events, halted, grazed, forked, log = c.events, c.halted, c.grazed, c.forked, c.log
+        if model.slots:
+            assert log is not None
+            at, news = there.t_after * model.direction, event & there.news
+            row = (at, there.y_before, there.y_after, there.slot, there.state.mode, there.transversality)
+            log = log.write(events, news, *row)
+            grazed, forked = grazed | (event & there.grazes), forked | (moved & there.forked)
+            events = events + news.astype(jnp.int32)
+            halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(step.keep, 0, halted))
+            result = RESULTS.where(event & (result == RESULTS.successful), there.result, result)
+            result = RESULTS.where(halted > 8 + 4 * len(model.switches), RESULTS.stuck_in_events, result)
+        accepted = c.accepted + moved.astype(jnp.int32)
+
+        def choose(which: Any, new: Any, old: Any) -> Any:
+            return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
+
+        new = (there.t_after, there.y_after, there.f_after, there.state)
+        t, y, f, state = choose(moved, new, (c.t, c.y, c.f, c.state))
+        steps = c.steps + c.active.astype(jnp.int32)
+        done = t >= self.t1
+        if any(k.ends for k in model.switches):
+            done = done | (event & there.news & self.ends(there))
+        few = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(c.t)
+        crawled = jnp.where(event | (step.step.t_next - c.t > few), 0, c.crawled + 1)
+        result = RESULTS.where((crawled > 64) & ~done, RESULTS.dt_min_reached, result)
+        result = self.verdict(c, step, t, y, f, moved, steps, events, done, result)
+        active = c.active & ~done & (result == RESULTS.successful)
+        return Carry(
+            t=t,
+            y=y,
+            f=f,
+            state=state,
+            dt=choose(c.active, step.dt, c.dt),
+            controller=choose(c.active, step.controller, c.controller),
+            active=active,
+            result=result,
+            steps=steps,
+            accepted=accepted,
+            events=events,
+            halted=halted,
+            halvings=step.halvings,
+            crawled=crawled,
+            grazed=grazed,
+            forked=forked,
+            margin=jnp.minimum(c.margin, jnp.where(c.active, there.margin, jnp.inf)),
+            log=log,
+            saved=self.save(c, there, moved, accepted),
+            meter=self.meter.step(c.meter, jnp.where(active, (t - self.t0) / (self.t1 - self.t0), 1.0)),
+        )
+
+    def ends(self, there: Landing) -> Bool[Array, ""]:
+        """Whether an event is one that ends the solution: of an impact, that is not a lift-off."""
+        last = jnp.zeros((), bool)
+        for i, slot in enumerate(self.model.slots):
+            switch = self.model.switches[slot.switch]
+            if switch.ends and not (slot.holding and isinstance(switch, impact)):
+                mode = there.state.mode[slot.switch]
+                wanted = jnp.stack([mode == value for value in switch.ends]).any()
+                last = last | ((there.slot == i) & wanted)
+        return last
+
+    def save(self, c: Carry, there: Landing, moved: Bool[Array, ""], accepted: Int[Array, ""]) -> Saved:
+        """What `saveat` asks for of this turn; at an event the states before and after it."""
+        system, direction = self.model.system, self.model.direction
+        saved = c.saved
+        if saved.request.ts is not None:
+            saved = saved.write_times(moved, c.t, there.t, there.points, c.state.mode, system, direction, self.reverse)
+        saved = saved.write_step(moved, c.accepted, c.t, there.t, there.points)
+        if self.keep_steps:
+            due = moved & ((accepted % self.keep_steps == 0) | there.found)
+            saved = saved.write(due, there.t, there.y_before, c.state.mode, system, direction)
+            after = (there.t_after, there.y_after, there.state.mode)
+            saved = saved.write(due & there.found, *after, system, direction)
+        return saved
+
+    def verdict(
+        self,
+        c: Carry,
+        step: _Attempt,
+        t: Scalar,
+        y: Y,
+        f: Y,
+        moved: Bool[Array, ""],
+        steps: Int[Array, ""],
+        events: Int[Array, ""],
+        done: Bool[Array, ""],
+        result: RESULTS,
+    ) -> RESULTS:
+        """Whether the lane can go on."""
+        good = result == RESULTS.successful
+        result = RESULTS.where((steps >= self.max_steps) & ~done & good, RESULTS.max_steps_reached, result)
+        if self.model.slots:
+            full = (events >= self.max_events) & ~done & (result == RESULTS.successful)
+            result = RESULTS.where(full, RESULTS.max_events_reached, result)
+        result = RESULTS.where(~finite((y, f)), RESULTS.nonfinite_field, result)
+        # Rejected again and again, down to nothing: at a place where the field ends, or where it is too rough.
+        least = 1e-6 * float(jnp.finfo(t.dtype).eps) * (self.t1 - self.t0)
+        tiny = ~moved & ((t + step.dt <= t) | (step.dt <= least)) & (result == RESULTS.successful)
+        ended = ~finite(step.step.y1)
+        result = RESULTS.where(tiny & ended, RESULTS.nonfinite_field, result)
+        result = RESULTS.where(tiny & ~ended, RESULTS.dt_min_reached, result)
+        return RESULTS.where(c.active, result, c.result)
+
+
+def _backward(step: Step, known: list) -> Bool[Array, ""]:
+    """Whether a guard that has just left a double root seems to fall from there. It rises, but at a loose tolerance its
+    polynomial need not tell."""
+    wrong = jnp.zeros((), bool)
+    for row, noises, counts in zip(step.guards, step.noise, known):
+        for c, noise, roots in zip(row, noises, counts):
+            for r in (2, 3)[: len(c) - 2]:
+                clear = ft.reduce(jnp.maximum, map(jnp.abs, c[r:])) > noise
+                wrong = wrong | ((roots == r) & (c[r] < 0) & clear)
+    return once(jnp.where(wrong, 1.0, 0.0)) > 0
+
+
+def finite(tree: Any) -> Bool[Array, ""]:
+    """Whether all numbers are finite: only then are all of their products with zero."""
+    return once(sum(jnp.sum(0 * x) for x in jax.tree.leaves(tree))) == 0
+
+
+def _landed(pred: Any, flow: Flow, here: tuple, default: Landing) -> Landing:
+    """`flow.land(*here)` for lanes with work to do, else `default`."""
+    dynamic, static = eqx.partition((flow, here), eqx.is_array)
+    dynamic_default, static_default = eqx.partition(default, eqx.is_array)
+
+    def branch(dynamic: Any) -> Any:
+        flow, here = eqx.combine(dynamic, static)
+        return eqx.filter(flow.land(*here), eqx.is_array)
+
+    if flow.reverse:  # `compact_cond` knows no transposition
+        return eqx.combine(lax.cond(pred, branch, lambda _: dynamic_default, dynamic), static_default)
+    return eqx.combine(compact_cond(pred, branch, (dynamic,), dynamic_default), static_default)

@@ -1,0 +1,335 @@
+"""The choice of mode where switches are at their surfaces."""
+
+import functools as ft
+import itertools
+from typing import Any
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from ..._numerics._autodiff import frozen
+from ..._numerics._linalg import nearly
+from ..._types import Scalar, Y
+from ...system._model import Model, State
+from ._attraction import coinciding, reach
+from ._laws import Instant, judge, Look, TRIED
+
+
+def settle(
+    model: Model,
+    t: Scalar,
+    y: Y,
+    state: State,
+    at: dict[int, Bool[Array, ""]],
+    leaves: dict[int, Int[Array, ""]],
+    given: tuple[int, ...] | None = None,
+) -> tuple[State, Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+    """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}, every contact one from {1, 0}.
+
+    An assignment is valid if each that holds has |λ| <= b (a contact a force λ >= 0) and each other one moves to its
+    side. Where up to four switches are at their surfaces every assignment is tried; of the valid ones those are
+    preferred in which no surface that repels holds what arrives at it, of these the ones that hold most, that keep what
+    held before, and that cross what is met. Where more are, all are held that attract, the one that violates its law
+    most is released, to the sign of its λ, and a released switch whose motion then opposes this is taken back, until
+    nothing is violated.
+
+    **Arguments:**
+
+    - `state`: the mode so far; a `sgn` switch that arrived at its surface still has the sign of the side it came from,
+        and one whose side is unknown has 0.
+    - `at`: for each `sgn` switch whether it is at its surface, for each contact whether it rests there (dh/dt = 0).
+    - `leaves`: for each switch the sign with which its λ just reached its bound, else 0.
+    - `given`: at the start of a solution the switches that keep the mode they have.
+
+    **Returns:** the new state; whether a side must be chosen (a start on a repulsive surface (2.25)); whether there is
+    another valid assignment, see `Solution.unique`; and whether not exactly one assignment was found.
+    """
+    model, t, y = frozen((model, t, y))  # modes have no derivative
+    which = tuple(at)
+    false = jnp.zeros((), bool)
+    if not which:
+        return state, false, false, false
+    here = Instant(model, t, y, state, at, leaves, given)
+    mode = dict(enumerate(state.mode))
+    trial = dict(mode)
+    for k in which:
+        if k in model.contacts:
+            trial[k] = jnp.where(at[k], jnp.where(leaves[k] != 0, 0, 1), mode[k])
+        elif k in model.holdable:
+            trial[k] = jnp.where(at[k], 0, mode[k])
+    if model.pairs:
+        here = _together(here, trial)
+        for k in filter(here.dry, which):
+            trial[k] = jnp.where(here.at[k], 0, trial[k])
+    noise = here.noise(here.look(trial).s if model.contacts else {})
+    trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
+    if len(which) == 1:
+        trial, seen, others, wrong = _alone(here, trial, noise)
+    elif len(which) <= TRIED:
+        trial, seen, others, wrong = _best(here, trial, noise)
+    else:
+        trial, seen, others, wrong = lax.cond(
+            here.many, ft.partial(_search, here), ft.partial(_best, here), trial, noise
+        )
+    at, leaves, state = here.at, here.leaves, here.state
+    s, rates, slopes, _ = seen
+    if model.contacts and len(model.holdable) > 1:
+        trial = _pinned(here, trial, rates)
+    roots, forked, unsure = list(state.roots), jnp.any(others), false
+    for i, k in enumerate(which):
+        if k in model.contacts:
+            # It lifts off with h = dh/dt = 0, and where its force has reached zero d²h/dt² = 0 too.
+            fresh = jnp.where(leaves[k] != 0, 3, 2)
+            edge = jnp.where(jnp.abs(s[k] * slopes[k]) <= noise[k], 1, 0)
+        else:
+            # Leaving with dh/dt = 0 (the end of sliding with b = 1) makes a double root of h at this instant.
+            simple = rates[k] * trial[k].astype(t.dtype) > 1e-10 * jnp.abs(slopes[k])
+            fresh = jnp.where(simple, 1, 2)
+            edge = jnp.zeros((), jnp.int32)
+            if k in model.holdable:
+                # What begins to be held with λ at its bound need not leave: where λ goes decides.
+                edge = model.edge(k, s[k], nearly(t))
+            if here.starts:
+                unsure = unsure | (here.open(k) & (trial[k] == 0) & (slopes[k] > 0) & others[i])
+        held = model.held(k, trial[k]) if k in model.holdable else False
+        roots[k] = jnp.where(here.open(k), jnp.where(held, edge, fresh), roots[k]).astype(jnp.int32)
+    for k in which if not model.steady else ():
+        if here.dry(k):
+            if here.starts:
+                (blur,) = model.rounding(lambda t, y, k=k: model.rates((k,), t, y, state, here.values(trial)[1]), t, y)
+                several = ~(jnp.maximum(jnp.abs(rates[k]), 2 * jnp.abs(slopes[k])) > blur)  # all fields are tangent
+            else:
+                # What is let go by a surface that has come to repel, beyond a two-fold, might have left it before.
+                several = (here.came[k] == 0) & (leaves[k] != 0) & (slopes[k] > 0)
+            forked = forked | (at[k] & several)
+    state = state._replace(mode=tuple(m.astype(jnp.int32) for m in trial.values()), roots=tuple(roots))
+    return state, unsure, forked, wrong
+
+
+def _together(here: Instant, trial: dict[int, Any]) -> Instant:
+    """Surfaces that coincide are met at one instant, and left at one instant."""
+    model, t, y, state = here.model, here.t, here.y, here.state
+    at, leaves, parts, h = dict(here.at), dict(here.leaves), list(state.part), {}
+    for i in sorted({i for pair in model.pairs for i in pair}):
+        k = model.holdable[i]
+        values, blur = jnp.stack(model.h(k, t, y)), model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y)
+        part = 0
+        if parts[k] is not None:
+            # What is off its surface is nearest to it with the least component.
+            part = jnp.where(at[k], parts[k], jnp.argmin(values).astype(jnp.int32))
+            parts[k] = part
+        h[i] = values[part], blur[part]
+    here = here._replace(state=state._replace(part=tuple(parts)))
+    first, s = here.values(trial)
+    s = tuple(jnp.where(jnp.isfinite(v), v, 0) for v in s)
+    rates, matrix = model.linear(t, y, first, s)
+    pairs, size = coinciding(model, rates, matrix), reach(model, matrix)
+    pushed = {model.holdable[i]: jnp.zeros((), jnp.int32) for i in h}
+    for (i, j), (same, _) in pairs.items():
+        for a, b in ((i, j), (j, i)):
+            k, other = model.holdable[a], model.holdable[b]
+            near = jnp.abs(h[b][0]) * size[a] <= h[b][1] * size[a] + 2 * jnp.abs(h[a][0]) * size[b]
+            at[other] = at[other] | (at[k] & same & near)
+        k, other = model.holdable[i], model.holdable[j]
+        both = same & at[k] & at[other]
+        pairs[i, j] = both, pairs[i, j][1]
+        # Their values reach the bounds together, each in the direction in which it resists.
+        turn = jnp.where((matrix[i, i] < 0) == (matrix[i, j] < 0), 1, -1)
+        for a, b in ((k, other), (other, k)):
+            follows = both & (leaves[b] == 0) & (here.came[b] == 0)
+            leaves[b] = jnp.where(follows, turn * leaves[a], leaves[b]).astype(jnp.int32)
+        for n, a in ((i, k), (j, other)):
+            push = jnp.where(matrix[n, n] < 0, leaves[a], -leaves[a])
+            pushed[a] = jnp.where(both, push, pushed[a])
+    return here._replace(at=at, leaves=leaves, pairs=pairs, pushed=pushed)
+
+
+def _elsewhere(
+    here: Instant, chosen: Int[Array, " m"], seen: Look, table: Int[Array, "rows m"], clear: Bool[Array, " rows"]
+) -> Bool[Array, " m"]:
+    """Which switches have another mode in one of the assignments of a table that are `clear`. Static friction that
+    holds goes on doing so, as its law says: that it might let go is no other solution."""
+    differs = table != chosen
+    for i, k in enumerate(here.which):
+        if not here.starts and here.dry(k) and here.model.static(k):
+            goes_on = (here.came[k] == 0) & (chosen[i] == 0) & (jnp.abs(seen.s[k]) > 1)
+            differs = differs & ~(goes_on & (np.arange(len(here.which)) == i))
+    return jnp.any(differs & clear[:, None], axis=0)
+
+
+def _assignments(here: Instant) -> tuple[Int[Array, "rows m"], Bool[Array, " rows"]]:
+    """All assignments of up to four switches that are at their surfaces, one a row; and which of the rows there are."""
+    model, which = here.model, here.which
+    options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
+    # A switch that is not at its surface has no choice: its first option stands for what it is.
+    at = jnp.stack([here.at[k] for k in which])
+    if len(which) <= TRIED:
+        table = np.array(list(itertools.product(*options)), np.int32)
+        return jnp.asarray(table), jnp.all(at | (table == np.array([o[0] for o in options], np.int32)), axis=1)
+    codes = np.array(list(itertools.product(range(3), repeat=TRIED)))  # which option the first, second, ... has
+    rank = jnp.cumsum(at) - 1
+    code = jnp.where(at, jnp.asarray(codes)[:, jnp.clip(rank, 0, TRIED - 1)], 0)
+    idle = np.arange(TRIED) > rank[-1]
+    real = jnp.all(code < np.array([len(o) for o in options]), axis=1) & jnp.all(~idle | (codes == 0), axis=1)
+    return jnp.asarray([(*o, 0)[:3] for o in options], jnp.int32)[np.arange(len(which)), code], real
+
+
+def _best(here: Instant, trial: dict, noise: dict) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
+    """The assignment to be preferred, of all that are valid; what it leads to; of each switch whether another solution
+    gives it another mode; and whether the choice is open."""
+    which = here.which
+    table, real = _assignments(here)
+    found = jax.vmap(ft.partial(judge, here, trial, noise))(table)
+    score = jnp.where(found.valid & real, found.rank, -1)
+    best = jnp.argmax(score)
+    seen = jax.tree.map(lambda x: x[best], found.seen)
+    others = _elsewhere(here, table[best], seen, table, found.sound[best] & found.clear & real)
+    out = {k: jnp.where(here.at[k], table[best, i], trial[k]).astype(jnp.int32) for i, k in enumerate(which)}
+    return trial | out, seen, others, jnp.sum(score == score[best]) != 1
+
+
+def _guess(here: Instant, trial: dict, seen: Look) -> dict:
+    """What is held as a first guess: all but what leaves, what repels, and what cannot be held."""
+    model, at, came, leaves, out = here.model, here.at, here.came, here.leaves, dict(trial)
+    for k in here.which:
+        if k in (here.given or ()):
+            out[k] = came[k]
+        elif here.dry(k):
+            side, repels = here.side(k, seen.slopes[k]), seen.slopes[k] >= 0
+            passes = repels & (came[k] != 0) & ~here.grips(k, seen.s[k])
+            out[k] = jnp.where(at[k] & (side != 0), side, jnp.where(at[k] & passes, -came[k], trial[k]))
+        elif k not in model.contacts:
+            unmoved = jnp.where(came[k] == 0, 1, came[k])
+            side = jnp.where(seen.rates[k] == 0, unmoved, jnp.sign(seen.rates[k]).astype(jnp.int32))
+            # It cannot but cross; at a double root the sign of dh/dt is rounding.
+            side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
+            out[k] = jnp.where(at[k], side, came[k])
+    return out
+
+
+def _alone(here: Instant, trial: dict, noise: dict) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
+    """The same as `_best` for one switch, which has no choice."""
+    ((k, at),) = here.at.items()
+    seen = here.look(trial)
+    first = _guess(here, trial, seen)
+    trial = _amend(here, first, here.look(first), noise)[0]
+    forked = jnp.zeros((), bool)
+    if here.dry(k):
+        held = _either(seen.s[k], here.model.bound(k), seen.slopes[k])
+        forked = at & here.fresh(k) & (here.leaves[k] == 0) & held
+    return trial, here.look(trial), forked[None], jnp.zeros((), bool)
+
+
+def _either(multiplier: Scalar, bound: Any, slope: Scalar) -> Bool[Array, ""]:
+    """Whether a surface can hold the solution (|λ| <= b) and let it go as well: because it repels, or because |λ| > 1,
+    so that on both sides the fields point the same way."""
+    size = jnp.abs(multiplier)
+    return (size <= bound) & ((slope > 0) | (size > 1 + nearly(size)))
+
+
+def _search(here: Instant, trial: dict, noise: dict) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
+    """The same where too many are at their surfaces to try every assignment."""
+    which, came, seen = here.which, here.came, here.look(trial)
+    trial = _guess(here, trial, seen)
+    # A bound that is reached together with that of another switch is left with it, not in a second event.
+    leaves = dict(here.leaves)
+    for k in which:
+        if here.dry(k):
+            over = seen.s[k] * came[k].astype(here.t.dtype) / here.model.bound(k) - 1
+            tied = here.open(k) & (came[k] != 0) & (seen.slopes[k] < 0) & (leaves[k] == 0)
+            tied = tied & (jnp.abs(over) <= nearly(over))
+            leaves[k] = jnp.where(tied, came[k], leaves[k])
+            trial[k] = jnp.where(tied, came[k], trial[k])
+    here = here._replace(leaves=leaves)
+
+    # One release or taking back a round, until nothing is violated; in all rounds together each can change twice.
+    def amend(carry: tuple) -> tuple:
+        count, trial, _ = carry
+        return count + 1, *_amend(here, trial, here.look(trial), noise)
+
+    def unsettled(carry: tuple) -> Bool[Array, ""]:
+        count, _, wrong = carry
+        return wrong & (count < 2 * len(which) + 2)
+
+    trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
+    begin = (jnp.zeros((), jnp.int32), trial, here.many)
+    _, trial, wrong = lax.while_loop(unsettled, amend, begin)
+    # Of all other assignments those in which one switch, or one group on surfaces that coincide, is let go or held.
+    chosen, seen, table = jnp.stack([trial[k] for k in which]), here.look(trial), []
+    for i, k in enumerate(which):
+        for value in (0, 1, -1) if here.dry(k) else ():
+            row = list(chosen)
+            row[i] = jnp.asarray(value, jnp.int32)
+            for pair, (same, ratio) in here.pairs.items():
+                a, b = (here.model.holdable[n] for n in pair)
+                if k in (a, b):
+                    n = which.index(b if k == a else a)
+                    row[n] = jnp.where(same, ratio.astype(jnp.int32) * value, row[n])
+            table.append(jnp.stack(row))
+    table = jnp.stack(table) if table else chosen[None]
+    clear = jax.vmap(ft.partial(judge, here, trial, noise))(table).clear
+    at = jnp.stack([here.at[k] for k in which])
+    real = jnp.all(at | (table == chosen), axis=1)
+    return trial, seen, _elsewhere(here, chosen, seen, table, clear & real), wrong
+
+
+def _pinned(here: Instant, trial: dict, rates: dict) -> dict:
+    """A `sgn` switch at its surface that a contact keeps there, whatever its own value, is neither side's. (One that
+    has just reached its bound has dh/dt = 0 too.)"""
+    model = here.model
+    held, s = here.values(trial)
+    _, matrix = model.linear(here.t, here.y, held, s)
+    out = dict(trial)
+    for i, k in enumerate(model.holdable):
+        if k in model.contacts:
+            continue
+        pull = sum(
+            jnp.where(here.at[c] & (trial[c] == 1), jnp.abs(matrix[i, j] * s[c]), 0)
+            for j, c in enumerate(model.holdable)
+            if c in model.contacts
+        )
+        pinned = here.open(k) & (here.leaves[k] == 0) & (pull > 0) & (jnp.abs(rates[k]) <= 1e-10 * pull)
+        out[k] = jnp.where(pinned, 0, trial[k]).astype(jnp.int32)
+    return out
+
+
+def _amend(here: Instant, trial: dict, seen: Look, noise: dict) -> tuple[dict, Bool[Array, ""]]:
+    """One release, or one taking back, of the switch that violates its law most."""
+    model, which = here.model, here.which
+    s, rates, slopes, _ = seen
+    excess, opposed = [], []
+    for k in which:
+        held = here.open(k) & model.held(k, trial[k]) if k in model.holdable else jnp.zeros((), bool)
+        if k in model.contacts:
+            over, against = -s[k] * slopes[k] - noise[k], -rates[k]
+        else:
+            over = jnp.abs(s[k]) / (model.bound(k) if k in model.holdable else 1) - 1
+            against = -rates[k] * trial[k].astype(rates[k].dtype)
+        excess.append(jnp.where(held, over, -1))
+        # What has just left has its λ at the bound (or it crosses): dh/dt may be zero but for rounding.
+        free = here.open(k) & ~held & (trial[k] != 0 if k not in model.contacts else True) & (here.leaves[k] == 0)
+        opposed.append(jnp.where(free & (against > 1e-10 * jnp.abs(slopes[k])), against, 0))
+    worst = jnp.stack(excess)
+    back = jnp.stack(opposed)
+    release = jnp.any(~(worst <= 0))  # a multiplier that is not a number is a violation too
+    retake = ~release & jnp.any(back > 0)
+    out = dict(trial)
+    for i, k in enumerate(which):
+        first = release & (jnp.argmax(jnp.where(jnp.isnan(worst), jnp.inf, worst)) == i)
+        again = retake & (jnp.argmax(back) == i)
+        if k in model.contacts:
+            side, taken = 0, 1
+        else:
+            taken = jnp.where(slopes[k] < 0, 0, -trial[k])
+            side = jnp.where((s[k] >= 0) == (slopes[k] < 0), 1, -1)  # where dh/dt = slope (s - λ) points
+        out[k] = jnp.where(first, side, jnp.where(again, taken, trial[k])).astype(jnp.int32)
+    # Surfaces that coincide are left and held together.
+    moved = dict(out)
+    for (i, j), (same, ratio) in here.pairs.items():
+        for k, other in ((model.holdable[i], model.holdable[j]), (model.holdable[j], model.holdable[i])):
+            follows = same & (out[k] != trial[k]) & here.open(other)
+            moved[other] = jnp.where(follows, ratio.astype(jnp.int32) * out[k], moved[other]).astype(jnp.int32)
+    return moved, release | retake

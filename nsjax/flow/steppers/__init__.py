@@ -1,0 +1,1 @@
+"""Steps in one mode: Runge-Kutta methods, Taylor series, the matrix exponential."""

@@ -1,0 +1,193 @@
+"""Brute-force bifurcation diagrams: where solutions settle, for many values of a parameter."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._numerics._text import between, shown, written
+from .._types import Scalar, Y
+from ..flow._arguments import check_solve
+from ..flow._results import outcomes, RESULTS
+from ..orbits._orbit import ravel
+from ..sweeps._sweep import sweep
+from ..system._parameter import parameter_path, put_parameter
+from ..system._system import arrays_of, System
+from ._poincare import Iterate, phase_map, PoincareMap, positive, Section, section_map
+
+
+@shown
+class BruteForce(eqx.Module):
+    """A brute-force bifurcation diagram: points of solutions on a section, after a transient.
+
+    **Attributes:**
+
+    - `parameter`: its name.
+    - `values`: its values, shape `(values,)`.
+    - `ts`: times of the points [time], shape `(values, starts, keep)`.
+    - `ys`: the points, states whose leaves have these three leading axes; not numbers from where a solution fails.
+    - `result`: `RESULTS`, shape `(values, starts)`.
+    """
+
+    parameter: str = eqx.field(static=True)
+    values: Float[Array, " values"]
+    ts: Float[Array, "values starts keep"]
+    ys: Y
+    result: RESULTS
+
+    def __str__(self) -> str:
+        *many, values, starts, keep = self.ts.shape
+        head = f"{np.prod(many)} brute-force diagrams" if many else "brute-force diagram"
+        return (
+            f"{head} over {self.parameter} = {between(self.values)}\n"
+            f"  values {values}, starts {starts}, points kept of each {keep}\n"
+            f"  points  {written(self.ys, self.ts.ndim)}\n"
+            f"  result  {outcomes(self.result)}"
+        )
+
+    def periods(self, tol: float = 1e-4) -> np.ndarray:
+        """After how many points each solution repeats itself: 0 where it does not within half of those kept, as in
+        chaos, -1 where there are no numbers.
+
+        **Arguments:**
+
+        - `tol`: what counts as the same, relative to how far a solution's points lie apart or from zero.
+
+        **Returns:** integers of shape `(values, starts)`.
+        """
+        points = np.asarray(jax.vmap(jax.vmap(jax.vmap(ravel)))(self.ys))
+        keep = points.shape[2]
+        size = tol * np.abs(points).max(axis=(2, 3))
+        out = np.where(np.isfinite(points).all(axis=(2, 3)), 0, -1)
+        for period in range(keep // 2, 0, -1):
+            gap = np.abs(points[:, :, period:] - points[:, :, :-period]).max(axis=(2, 3))
+            out = np.where(gap <= size, period, out)
+        return out
+
+
+class _Lane(eqx.Module):
+    """One solution for each value, or one for all of them, one after the other."""
+
+    system: System
+    path: tuple[str, ...] = eqx.field(static=True)
+    step: PoincareMap
+    t0: Scalar
+    values: Float[Array, " values"]
+    transient: int = eqx.field(static=True)
+    keep: int = eqx.field(static=True)
+
+    def points(self, value: Scalar, y: Y) -> Iterate:
+        system = put_parameter(self.system, self.path, value)
+        start = self.step.start(system, self.t0, y, {})
+        if self.transient:
+            start = self.step.skip(system, start, self.transient)
+        return self.step.iterates(system, start, self.keep)
+
+
+class _Apart(_Lane):
+    def __call__(self, value: Scalar, y: Y) -> tuple[Scalar, Y, RESULTS]:
+        found = self.points(value, y)
+        return found.t, found.y, jax.tree.map(lambda x: x[-1], found.result)
+
+
+class _Carried(_Lane):
+    def __call__(self, first: Y) -> tuple[Scalar, Y, RESULTS]:
+        def at(y: Y, value: Scalar) -> tuple[Y, Any]:
+            found = self.points(value, y)
+            last, result = jax.tree.map(lambda x: x[-1], (found.y, found.result))
+            # Where the solution fails, the next value begins anew.
+            lost = ~jnp.isfinite(ravel(last)).all()
+            return jax.tree.map(lambda a, b: jnp.where(lost, a, b), first, last), (found.t, found.y, result)
+
+        return lax.scan(at, first, self.values)[1]
+
+
+def brute_force(
+    system: System,
+    parameter: str,
+    values: Any,
+    starts: Y,
+    *,
+    section: Section | None = None,
+    direction: int = 1,
+    max_time: Any = None,
+    transient: int = 200,
+    keep: int = 50,
+    carry: bool = False,
+    t0: Any = 0.0,
+    solver: dfx.AbstractSolver = dfx.Tsit5(),
+    stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    max_steps: int = 4096,
+    max_events: int = 256,
+    chunk: int | None = None,
+) -> BruteForce:
+    """A brute-force bifurcation diagram: for each value of a parameter, the points at which solutions pierce a Poincaré
+    section after a transient.
+
+    ```python
+    found = nsjax.brute_force(system, "omega", jnp.linspace(1.5, 1.9, 400), State(1.0, 0.0))
+    ax = nsjax.plot.brute_force(found, "x")
+    ```
+
+    It shows what attracts: chaos and all that is stable, if `starts` lie in every basin; nothing unstable.
+
+    **Arguments:**
+
+    - `system`: the model.
+    - `parameter`: the name of a field.
+    - `values`: its values, shape `(values,)` [unit of the parameter].
+    - `starts`: states at `t0`, leaves with a leading axis; each is followed for every value. Or one state of scalars.
+    - `section`, `direction`, `max_time`: as for `poincare_map`; by default points are taken once in each period of the
+        forcing, at the phase of `t0` (6.9).
+    - `transient`: how many points are left out.
+    - `keep`: how many are kept.
+    - `carry`: whether each value begins where the solution for the one before it ended, in the order of `values`, which
+        follows a branch to where it ends: with `values` rising and falling it shows hysteresis. `starts` are for the
+        first. By default every value has all of them.
+    - `solver`, `stepsize_controller`: as for `solve`. `max_steps`, `max_events`: for each point.
+    - `chunk`: how many solutions go together, see `sweep`.
+
+    **Returns:** a `BruteForce`. Solutions that fail, or return no more, have a `result` that says why.
+
+    **Raises:** `TypeError`, `ValueError` for mistakes in the arguments.
+    """
+    for name, number in (("transient", transient + 1 if isinstance(transient, int) else transient), ("keep", keep)):
+        positive(name, number)
+    if all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(starts)):
+        starts = jax.tree.map(lambda x: jnp.asarray(x)[None], starts)
+    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(starts)}
+    if len(lengths) != 1 or () in lengths:
+        raise ValueError(
+            "Argument `starts` must hold states whose leaves have one leading axis of the same length, but the shapes "
+            f"are {', '.join(str(jnp.shape(leaf)) for leaf in jax.tree.leaves(starts))}."
+        )
+    one = jax.tree.map(lambda x: x[0], starts)
+    y0, t0, _, solver, controller, _ = check_solve(
+        system, t0, t0, one, None, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events, None
+    )
+    path = parameter_path(system, parameter)
+    system = arrays_of(system, t0.dtype)
+    values = jnp.asarray(values, t0.dtype)
+    if values.ndim != 1 or not len(values):
+        raise ValueError(f"Argument `values` must be a vector, but its shape is {values.shape}.")
+    how = dict(solver=solver, stepsize_controller=controller, max_steps=max_steps, max_events=max_events)
+    if section is None:
+        step = phase_map(system, 1, how)
+    else:
+        step = section_map(system, section, direction, max_time, t0, y0, how)
+    starts = jax.tree.map(lambda x: jnp.asarray(x, t0.dtype), starts)
+    number = len(jax.tree.leaves(starts)[0])
+    args = (system, path, step, t0, values, transient, keep)
+    if carry:
+        found = sweep(_Carried(*args), starts, chunk=chunk)
+        found = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), found)
+    else:
+        each = jax.tree.map(lambda x: jnp.tile(x, (len(values),) + (1,) * (x.ndim - 1)), starts)
+        found = sweep(_Apart(*args), jnp.repeat(values, number), each, chunk=chunk)
+        found = jax.tree.map(lambda x: x.reshape(len(values), number, *x.shape[1:]), found)
+    return BruteForce(parameter, values, *found)

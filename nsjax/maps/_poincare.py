@@ -1,0 +1,483 @@
+"""Poincaré maps: from one crossing of a section to the next, (6.4), and over a period of the forcing, (6.10).
+
+A section is watched like a switch on which nothing depends, and the solution ends at its event: there the field jumps
+from f to 0, so that the saltation matrix (3.30) is I - f nᵀ / (nᵀ f), and the derivative of the map is (6.7).
+"""
+
+import abc
+import functools as ft
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .._numerics._autodiff import frozen
+from .._numerics._text import between, listed, shown, written
+from .._types import Scalar, Y
+from ..flow._arguments import check_solve
+from ..flow._results import is_okay, outcomes, raise_if, RESULTS
+from ..flow._solve import solve
+from ..flow.events._initial_mode import AT_ONCE, start_mode
+from ..system._checks import check_model, check_system
+from ..system._model import Model, State
+from ..system._system import AbstractSwitch, arrays_of, clock, forwarded, impact, relay, sgn, SwitchValues, System
+
+
+PERIODS = 100  # of the forcing in which a solution is expected to return
+
+Section = Callable[[Scalar, Y], Scalar] | str
+
+
+@shown
+class Iterate(NamedTuple):
+    """An iterate of a Poincaré map; several have a leading axis.
+
+    **Attributes:**
+
+    - `t`: its time [time].
+    - `y`: the state there; not numbers where there is none.
+    - `mode`: one value for each switch, as `mode=` of `poincare_map` and `solve` takes it.
+    - `result`: `RESULTS`.
+    """
+
+    t: Scalar
+    y: Y
+    mode: Int[Array, " switches"]
+    result: RESULTS
+
+    def __str__(self) -> str:
+        axes = jnp.ndim(self.t)
+        if axes:
+            head = f"{self.t.size} iterates from t = {between(self.t)}"
+            return f"{head}\n  states  {written(self.y, axes)}\n  result  {outcomes(self.result)}"
+        mode = f"; mode ({listed(self.mode)})" if len(self.mode) else ""
+        return f"iterate at t = {float(self.t):.10g}: {written(self.y)}{mode}; {outcomes(self.result)}"
+
+
+def _section_name(system: System) -> str:
+    name = "section"
+    while any(k.name == name for k in system.switches):
+        name += "_"
+    return name
+
+
+@ft.cache  # switches are told apart by identity
+def _watch(name: str, ends: tuple[int, ...]) -> AbstractSwitch:
+    return sgn(lambda self, t, y: self.section(t, y), name=name)._with(ends=ends)
+
+
+@ft.cache
+def _ending(switch: AbstractSwitch, ends: tuple[int, ...]) -> AbstractSwitch:
+    return forwarded(switch)._with(ends=ends)
+
+
+class _Watched(System):
+    """A system whose solutions end at a section: at a function's zero, or at an event of one of its switches."""
+
+    system: System
+    section: Callable[[Scalar, Y], Scalar] | None
+    name: str | None = eqx.field(static=True)  # of the switch, if it is one
+    direction: int = eqx.field(static=True)
+
+    @property
+    def switches(self) -> tuple[AbstractSwitch, ...]:
+        if self.section is None:
+            return tuple(
+                _ending(k, _ends(k, self.direction)) if k.name == self.name else forwarded(k)
+                for k in self.system.switches
+            )
+        ends = (self.direction,) if self.direction else (1, -1)
+        # Last: at an instant which it shares with an event the state on the section is that after the event.
+        return (*map(forwarded, self.system.switches), _watch(_section_name(self.system), ends))
+
+    def vector_field(self, t: Scalar, y: Y, s: SwitchValues) -> Y:
+        return self.system.vector_field(t, y, self.system.values(tuple(s[k.name] for k in self.system.switches)))
+
+    @property
+    def period(self) -> Float[Array, ""] | float | None:
+        return self.system.period
+
+
+def _ends(switch: AbstractSwitch, direction: int) -> tuple[int, ...]:
+    """The modes to which an event of this switch leads, if it is one of the section."""
+    if isinstance(switch, sgn):
+        return (direction,) if direction else (1, 0, -1)
+    if isinstance(switch, relay):
+        return ((1 + direction) // 2,) if direction else (1, 0)
+    return (1, 0)
+
+
+class Start(NamedTuple):
+    """Where iterates begin."""
+
+    t0: Scalar  # of the solution
+    t: Scalar
+    y: Y
+    mode: Int[Array, " switches"]
+    result: RESULTS
+    named: tuple[bool, ...]  # which switches `mode=` of `solve` may name
+
+
+class PoincareMap(eqx.Module):
+    """A Poincaré map, applied over and over."""
+
+    how: dict[str, Any]  # arguments of `solve`
+
+    @abc.abstractmethod
+    def flow_of(self, system: System) -> System:
+        """The system to be solved."""
+
+    @abc.abstractmethod
+    def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
+        """The next iterate after the one at (t, y), of a solution that began at t0."""
+
+    @abc.abstractmethod
+    def horizon(self, system: System, t: Scalar) -> Scalar:
+        """How long one application may take."""
+
+    def start(self, system: System, t: Scalar, y: Y, given: dict[str, Any]) -> Start:
+        """What `iterates` begins with."""
+        one = jnp.ones_like(t)
+        t = check_model(system, t, y, one)
+        system = self.flow_of(system)
+        still, t_still, y_still = frozen((system, t, y))
+        model = Model(still, one, t_still, y_still)
+        # An impact that cannot be rested upon has one mode only, of which `solve` wants to hear nothing.
+        named = tuple(k in model.contacts or not isinstance(s, impact) for k, s in enumerate(model.switches))
+        given = {s.name: given[s.name] for s, may in zip(model.switches, named) if may and s.name in given}
+        state, _, result = start_mode(model, t_still, y_still, given, self.horizon(still, t))
+        modes = [m.astype(jnp.int32) for m in self.sides(model, t_still, y_still, state)]
+        return Start(t, t, y, jnp.stack(modes) if modes else jnp.zeros(0, jnp.int32), result, named)
+
+    def sides(self, model: Model, t: Scalar, y: Y, state: State) -> tuple[Array, ...]:
+        """The mode in which a solution sets out."""
+        return state.mode
+
+    def iterates(self, system: System, start: Start, number: int, each: int = 1) -> Iterate:
+        """So many iterates, of the `each`-th power of the map, from what `start` returned."""
+        begin, step = self._stepping(system, start)
+        _, rows = lax.scan(lambda here, _: (step(here),) * 2, begin, None, length=number * each)
+        t, y, mode, result = jax.tree.map(lambda x: x[each - 1 :: each], rows)
+        t = jax.vmap(unless_failed)(result, t)
+        return Iterate(t, y, mode[:, : len(system.switches)], result)
+
+    def skip(self, system: System, start: Start, number: int) -> Start:
+        """So many iterates later."""
+        begin, step = self._stepping(system, start)
+        now = lax.fori_loop(0, number, lambda _, here: step(here), begin)
+        t, y, mode, result = now
+        return Start(start.t0, t, y, mode, result, start.named)
+
+    def _stepping(self, system: System, start: Start) -> tuple[tuple, Callable[[tuple], tuple]]:
+        system = self.flow_of(system)
+        names = [k.name for k in system.switches]
+
+        def step(here: tuple) -> tuple:
+            t, y, mode, result = here
+            given = {name: mode[k] for k, name in enumerate(names) if start.named[k]}
+            later, y, mode, now = self.once(system, t, start.t0, y, given)
+            # What has failed stays failed; it goes on from states that are no numbers, which takes no step.
+            result = RESULTS.where(is_okay(result) & (now != RESULTS.successful), now, result)
+            return jnp.where(is_okay(result), later, t), unless_failed(result, y), mode, result
+
+        return (start.t, start.y, start.mode, start.result), step
+
+
+class _Section(PoincareMap):
+    """From one crossing of a section to the next."""
+
+    section: Callable[[Scalar, Y], Scalar] | None
+    name: str | None = eqx.field(static=True)
+    direction: int = eqx.field(static=True)
+    max_time: Scalar
+
+    def flow_of(self, system: System) -> System:
+        return _Watched(system, self.section, self.name, self.direction)
+
+    def horizon(self, system: System, t: Scalar) -> Scalar:
+        return self.max_time
+
+    def sides(self, model: Model, t: Scalar, y: Y, state: State) -> tuple[Array, ...]:
+        """A start on the section is no return. Nor is one that an earlier computation left a little before it: it
+        counts as being beyond."""
+        if self.section is None:
+            return state.mode
+        *others, side = state.mode
+        k = len(others)
+        h, rate = model.h(k, t, y)[0], model.approach(k, t, y, state)
+        at_once = AT_ONCE * float(jnp.finfo(t.dtype).eps) ** 0.5 * self.max_time
+        on = (jnp.abs(h) <= at_once * jnp.abs(rate)) & (rate != 0)
+        return *others, jnp.where(on, jnp.sign(rate).astype(jnp.int32), side)
+
+    def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
+        end = t + self.max_time
+        sol = solve(system, t, end, y, mode=mode, throw=False, **self.how)
+        late = is_okay(sol.result) & ~(sol.t1 < end)
+        y1 = sol.y1
+        for switch in system.switches:
+            if isinstance(switch, impact) and switch.ends:
+                y1 = _onto(switch, system, sol.t1, y1)
+        return sol.t1, y1, sol.mode1, RESULTS.where(late, RESULTS.no_return, sol.result)
+
+
+def _onto(switch: AbstractSwitch, system: System, t: Scalar, y: Y) -> Y:
+    """The state after an impact without what rounding has left between it and the surface: where h is compared with
+    nothing but zero, a solution that goes on from there must not begin beyond it."""
+    flat, unravel = jfu.ravel_pytree(y)
+    still, t_still, x = frozen((system, t, flat))
+
+    def gap(x: Array) -> Scalar:
+        return ft.reduce(jnp.minimum, switch.components(still, t_still, unravel(x)))
+
+    h, normal = jax.value_and_grad(gap)(x)
+    return unravel(flat - h * normal / jnp.where(normal @ normal == 0, 1, normal @ normal))
+
+
+class _Phase(PoincareMap):
+    """From one phase of the forcing to the next."""
+
+    order: int = eqx.field(static=True)
+
+    def flow_of(self, system: System) -> System:
+        return system
+
+    def horizon(self, system: System, t: Scalar) -> Scalar:
+        return jnp.asarray(system.period, t.dtype) * self.order
+
+    def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
+        # Each time from t0, so that time does not lose digits.
+        period = self.horizon(system, t)
+        sol = solve(system, t0, t0 + period, y, mode=mode or None, throw=False, **self.how)
+        return t + period, sol.y1, sol.mode1, sol.result
+
+
+def unless_failed(result: RESULTS, tree: Any) -> Any:
+    """`tree`, or what are no numbers, nor their derivatives."""
+    return jax.tree.map(lambda x: x * jnp.where(is_okay(result), 1, jnp.nan).astype(x.dtype), tree)
+
+
+def positive(name: str, value: Any) -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise ValueError(f"Argument `{name}` must be a positive integer, but got {value!r}.")
+
+
+def section_map(
+    system: System, section: Section, direction: int, max_time: Any, t: Scalar, y: Y, how: dict[str, Any]
+) -> PoincareMap:
+    """The map of a section, after a look at the arguments that make it."""
+    owner = type(system).__name__
+    if direction not in (1, 0, -1):
+        raise ValueError(f"Argument `direction` must be 1, -1 or 0 (both), but got {direction!r}.")
+    if isinstance(section, str):
+        found = {k.name: k for k in system.switches}.get(section)
+        if found is None:
+            known = ", ".join(f"`{k.name}`" for k in system.switches) or "none"
+            raise ValueError(
+                f"Argument `section` must be a function of (t, y), or the name of a switch of `{owner}` ({known}), but "
+                f"got {section!r}."
+            )
+        if isinstance(found, clock):
+            raise ValueError(
+                f"Argument `section` must not be the clock `{section}`, which ticks by itself: take "
+                "`nsjax.stroboscopic_map`."
+            )
+        if isinstance(found, impact) and direction == -1:
+            raise ValueError(
+                f"Argument `direction` must be 1 or 0 for the impact `{section}`, as an iterate is the state after it, "
+                "but got -1."
+            )
+    elif callable(section):
+        h = jax.eval_shape(section, t, y)
+        if not isinstance(h, jax.ShapeDtypeStruct) or h.shape != () or h.dtype != t.dtype:
+            got = f"{h.dtype}{list(h.shape)}" if isinstance(h, jax.ShapeDtypeStruct) else repr(h)
+            raise ValueError(
+                f"Argument `section` must return a scalar of dtype {t.dtype}, which vanishes on the section, but "
+                f"returned {got}."
+            )
+    else:
+        raise TypeError(
+            f"Argument `section` must be a function of (t, y), or the name of a switch, but got {section!r}."
+        )
+    if max_time is None and system.period is None:
+        raise ValueError(
+            f"Argument `max_time` must be given, as `{owner}` is autonomous and has no time of its own: how long a "
+            "solution may take to return [time]."
+        )
+    time = jnp.asarray(system.period, t.dtype) * PERIODS if max_time is None else jnp.asarray(max_time, t.dtype)
+    if isinstance(section, str):
+        return _Section(how, None, section, direction, time)
+    # A plain function is no array, nor has it any: it belongs to the structure.
+    plain = jax.tree.leaves(section) == [section]
+    return _Section(how, jax.tree_util.Partial(section) if plain else section, None, direction, time)
+
+
+def phase_map(system: System, order: int, how: dict[str, Any]) -> PoincareMap:
+    """The map over periods of the forcing."""
+    check_system(system)
+    positive("order", order)
+    if system.period is None:
+        raise ValueError(
+            f"Argument `system` must be forced for a map over its period, but `{type(system).__name__}.period` is "
+            "None. For an autonomous system take `nsjax.poincare_map` with a section."
+        )
+    return _Phase(how, order)
+
+
+@eqx.filter_jit
+def _apply(
+    step: PoincareMap, system: System, t0: Scalar, y0: Y, given: dict[str, Any], number: int, each: int, single: bool
+) -> Iterate:
+    rows = step.iterates(system, step.start(system, t0, y0, given), number, each)
+    return jax.tree.map(lambda x: x[0], rows) if single else rows
+
+
+def _iterated(
+    make: Callable[[System, Scalar, Y, dict], PoincareMap],
+    system: System,
+    y0: Y,
+    t0: Any,
+    mode: Any,
+    iterates: int | None,
+    each: int,
+    how: dict[str, Any],
+    throw: bool,
+) -> Iterate:
+    """Checks what the two maps have in common, and applies them."""
+    if iterates is not None:
+        positive("iterates", iterates)
+    saveat, bounds = dfx.SaveAt(t1=True), (how["max_steps"], how["max_events"])
+    check_system(system)
+    y0, t0, _, solver, controller, given = check_solve(
+        system, t0, t0, y0, mode, how["solver"], how["stepsize_controller"], saveat, *bounds, how["adjoint"]
+    )
+    system = arrays_of(system, t0.dtype)
+    step = make(system, t0, y0, how | dict(solver=solver, stepsize_controller=controller))
+    out = _apply(step, system, t0, y0, given, iterates or 1, each, iterates is None)
+    if throw:
+        last = jax.tree.map(lambda x: x if iterates is None else x[-1], out.result)
+        out = raise_if(~is_okay(last), last, out)
+    return out
+
+
+def poincare_map(
+    system: System,
+    section: Section,
+    y0: Y,
+    *,
+    direction: int = 1,
+    number: int = 1,
+    iterates: int | None = None,
+    max_time: Any = None,
+    t0: Any = 0.0,
+    mode: Any = None,
+    solver: dfx.AbstractSolver = dfx.Tsit5(),
+    stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    max_steps: int = 4096,
+    max_events: int = 256,
+    adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
+    throw: bool = True,
+) -> Iterate:
+    """The Poincaré map (6.4): where the solution from `y0` meets a section next.
+
+    ```python
+    def top(t, y):  # x is largest where v falls through zero
+        return y.v
+
+    first = nsjax.poincare_map(nsjax.gallery.StickSlip(), top, y0, direction=-1, max_time=100.0)
+    first.t, first.y.x
+    ```
+
+    The crossing is located like an event, to the accuracy of the flow. `jax.jacfwd` of the state with respect to `y0`
+    is the derivative (6.7) of the map; of the time, how much later solutions from beside `y0` return.
+
+    A start on the section is no crossing of it: the solution leaves first. So is one that would cross it within
+    1.5e-10 of `max_time` (float32: 3.5e-6). What an impact jumps over is not crossed.
+
+    **Arguments:**
+
+    - `system`: the model.
+    - `section`: a function `h(t, y)` of time and state, zero on the section and smooth near it; or the name of a
+        switch, whose events are then the iterates, with the state after them. The latter is for sections on which the
+        solution slides or from which it rebounds. (Every new function is compiled: define it once, not in a loop.)
+    - `y0`: the state at `t0`, on the section or not.
+    - `direction`: 1 to count crossings where h rises, -1 where it falls, 0 for both. Of a `sgn` switch, crossings to
+        that side, and 0 for all of its events; of a relay 1 where it switches on, -1 off; of an impact 1 or 0.
+    - `number`: the how-manieth crossing: that power of the map.
+    - `iterates`: how many iterates, which then have a leading axis; by default one, without.
+    - `max_time`: how long each return may take [time]; forced systems: by default a hundred periods.
+    - `t0`, `mode`, `solver`, `stepsize_controller`, `max_events`, `adjoint`: as for `solve`. `max_steps`: for each
+        return.
+    - `throw`: whether a failure raises; if not, look at `Iterate.result`, which has one entry a lane under `vmap`.
+
+    **Returns:** an `Iterate`: time, state and mode at the crossing. Its result is `RESULTS.tangential_event`, which is
+    no failure, where the solution grazed a surface, or the section.
+
+    **Raises:** `TypeError`, `ValueError` for mistakes in the arguments; a runtime error if the solution does not
+    return.
+    """
+    positive("number", number)
+    how = dict(
+        solver=solver,
+        stepsize_controller=stepsize_controller,
+        max_steps=max_steps,
+        max_events=max_events,
+        adjoint=adjoint,
+    )
+
+    def make(system: System, t: Scalar, y: Y, how: dict[str, Any]) -> PoincareMap:
+        return section_map(system, section, direction, max_time, t, y, how)
+
+    return _iterated(make, system, y0, t0, mode, iterates, number, how, throw)
+
+
+def stroboscopic_map(
+    system: System,
+    y0: Y,
+    *,
+    order: int = 1,
+    iterates: int | None = None,
+    t0: Any = 0.0,
+    mode: Any = None,
+    solver: dfx.AbstractSolver = dfx.Tsit5(),
+    stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    max_steps: int = 4096,
+    max_events: int = 256,
+    adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
+    throw: bool = True,
+) -> Iterate:
+    """The T-advance map (6.10) of a forced system: the state `order` periods of the forcing later.
+
+    Its derivative by `jax.jacfwd` is the fundamental solution matrix.
+
+    **Arguments:**
+
+    - `system`: the model, whose `period` is not None.
+    - `y0`: the state at `t0`.
+    - `order`: over how many periods of the forcing.
+    - `iterates`: how many iterates, which then have a leading axis; by default one, without.
+    - `t0`: the phase of the forcing [time].
+    - `mode`, `solver`, `stepsize_controller`, `adjoint`: as for `solve`. `max_steps`, `max_events`: for each iterate.
+    - `throw`: whether a failure raises; if not, look at `Iterate.result`.
+
+    **Returns:** an `Iterate`.
+
+    **Raises:** `ValueError` for an autonomous system; a runtime error where `solve` fails.
+    """
+    how = dict(
+        solver=solver,
+        stepsize_controller=stepsize_controller,
+        max_steps=max_steps,
+        max_events=max_events,
+        adjoint=adjoint,
+    )
+
+    def make(system: System, t: Scalar, y: Y, how: dict[str, Any]) -> PoincareMap:
+        return phase_map(system, order, how)
+
+    return _iterated(make, system, y0, t0, mode, iterates, 1, how, throw)

@@ -1,0 +1,227 @@
+"""The search for a periodic orbit, and for all that many starts lead to."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+
+from .._numerics._autodiff import dense_jacobian, forward_only
+from .._numerics._text import known, suggesting, written
+from .._types import StateT, Y
+from ..flow._arguments import check_numbers, check_solve
+from ..flow._results import is_okay, raise_if, RESULTS, SolveError
+from ..flow._solve import HINTS
+from ..sweeps._sweep import sweep
+from ..system._checks import check_autonomous, check_clocks, check_direction
+from ..system._system import arrays_of, System
+from ._orbit import Orbit, ravel
+from ._search import Search
+from .segments._guess import Segment
+
+
+def _inversion(y: Y) -> Y:
+    return jax.tree.map(jnp.negative, y)
+
+
+@suggesting(HINTS | {"T": "Write `period=...`."})
+def find_orbit(
+    system: System,
+    y0: StateT,
+    *,
+    period: Any = None,
+    t0: Any = 0.0,
+    order: int | None = 1,
+    symmetry: Callable[[StateT], StateT] | Literal["inversion"] | None = None,
+    backward: bool = False,
+    mode: Any = None,
+    method: Literal["shooting", "segments"] | None = None,
+    segments: Sequence[Segment] | None = None,
+    pieces: int = 1,
+    solver: dfx.AbstractSolver = dfx.Dopri8(),
+    stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    tol: float | None = None,
+    max_iterations: int = 30,
+    max_steps: int = 4096,
+    max_events: int = 64,
+    adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
+    throw: bool = True,
+) -> Orbit[StateT]:
+    """Finds a periodic orbit by optimistix's Newton method, in one of two formulations.
+
+    *Shooting*, y(t0 + period) = y0, goes through the event-driven flow, which finds the itinerary. With *segments* the
+    itinerary is given, by `segments` or by the solution from the guess, and the states and times at all events are
+    unknown; each segment is a smooth flow in its mode. That stays well-posed on surfaces that repel and, in `pieces`,
+    for violently unstable orbits; `Orbit.admissible` tells whether what it found is a solution.
+
+    For an autonomous system the period is unknown too and Poincaré's phase condition is added; the base point of the
+    result is moved away from events. The orbit's period, states and multipliers are differentiable with respect to the
+    parameters of `system`, twice too, by implicit differentiation.
+
+    Where shooting does not converge from the guess, segments are tried, whole and in sixteen pieces (unless `method`
+    is given; each is a program to be compiled); and then the same from where the solution settles. This needs concrete
+    values: under `jit` or `vmap` there is one try.
+
+    **Arguments:**
+
+    - `system`: the model. It is forced if its `period` is not None.
+    - `y0`: a guess of a state on the orbit, for a forced system at time `t0`.
+    - `period`: autonomous systems: a guess of the period [time]; found by following the solution if None. For forced
+        systems it is `order * system.period`, and must not be given.
+    - `t0`: time of the base point.
+    - `order`: subharmonic order of a forced orbit; if None, the solution is followed to where it settles, and after
+        how many periods of the forcing (up to 16) it repeats itself there is found out.
+    - `symmetry`: for an orbit with y(t + period/2) = `symmetry`(y(t)), a function of the state, or "inversion" for
+        -y (6.24). Shooting takes half the period then, and finds no orbit that is less symmetric.
+    - `backward`: whether to shoot in backward time: for an orbit that leaves a surface which repels (section 6.7), or
+        whose multipliers all lie outside the unit circle. What is returned is the orbit as it runs forwards.
+    - `mode`: as for `solve`, for a guess on a surface, or within the hysteresis of a relay. Without it
+        both modes of up to four relays are tried, off first; under `jit` and `vmap` they are off. A state that comes
+        back with the relay in the other mode is no orbit.
+    - `method`: "shooting" or "segments"; by default segments if these or `pieces` are given, else shooting, and see
+        above.
+    - `segments`: the itinerary and its durations, from `y0` on, as a list of `Segment`; the last ends where the first
+        begins, and so is in the same mode. `y0` lies on no surface.
+    - `pieces`: into how many pieces of equal length each segment is divided: multiple shooting, for orbits so unstable
+        that no single solution follows them.
+    - `solver`, `stepsize_controller`, `max_steps`, `max_events`: as for `solve`; by default Dopri8 with tolerances of
+        1e-12 (float32: 1e-6).
+    - `tol`: tolerance of Newton's method, by default 1e-10 (float32: 1e-4).
+    - `adjoint`: `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`; for `jax.grad` and `jax.linearize` (and so for
+        optimistix's optimisers) `diffrax.DirectAdjoint()`, at the cost of a forward derivative for each parameter that
+        is perturbed.
+    - `throw`: whether a failure raises; if not, look at `Orbit.result`. Derivatives are not numbers where there is no
+        orbit.
+
+    **Returns:** an `Orbit`. Its result is `RESULTS.tangential_event`, which is no failure, if it grazes a surface: the
+    orbit is right, but its multipliers are not defined.
+
+    **Raises:** `ValueError` for a model that depends on the time but has no `period`, and for arguments that do not fit
+    together; a runtime error that says whether the search ended in an equilibrium, in a multiple cover of a shorter
+    orbit, or nowhere.
+    """
+    if order is not None and (not isinstance(order, int) or order < 1):
+        raise ValueError(f"Argument `order` must be a positive integer or None, but got {order!r}.")
+    y0, t0, _, solver, controller, given = check_solve(
+        system, t0, t0, y0, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events, None
+    )
+    double = bool(jnp.finfo(t0.dtype).eps < 1e-10)
+    if stepsize_controller is None:
+        small = 1e-12 if double else 1e-6
+        controller = dfx.PIDController(rtol=small, atol=small)
+    tol = (1e-10 if double else 1e-4) if tol is None else tol
+    if method not in (None, "shooting", "segments"):
+        raise ValueError(f"Argument `method` must be 'shooting' or 'segments', but got {method!r}.")
+    if symmetry is not None and (method == "segments" or segments is not None or pieces != 1):
+        raise ValueError("Argument `symmetry` is for `method='shooting'`, but segments are asked for.")
+    if symmetry == "inversion":
+        symmetry = _inversion
+    if symmetry is not None and not callable(symmetry):
+        raise ValueError(f"Argument `symmetry` must be a function or 'inversion', but got {symmetry!r}.")
+    if backward and (method == "segments" or segments is not None or pieces != 1):
+        raise ValueError("Argument `backward` is for `method='shooting'`, but segments are asked for.")
+    if method == "shooting" and (segments is not None or pieces != 1):
+        raise ValueError("Arguments `segments` and `pieces` are for `method='segments'`, but it is 'shooting'.")
+    if not isinstance(pieces, int) or not 1 <= pieces <= 64:
+        raise ValueError(f"Argument `pieces` must be an integer from 1 to 64, but got {pieces!r}.")
+    check_direction(system, backward)
+    if throw:
+        check_numbers(system, t0, t0, y0)
+    system = arrays_of(system, t0.dtype)
+    how = dict(solver=solver, stepsize_controller=controller, max_steps=max_steps, max_events=max_events)
+    autonomous = system.period is None
+    if autonomous:
+        check_autonomous(system, t0, y0)
+    else:
+        check_clocks(system)
+    if not autonomous and period is not None:
+        raise ValueError("Argument `period` must not be given for a forced system; use `order` for a subharmonic.")
+    if autonomous and order not in (1, None):
+        raise ValueError("Argument `order` must be 1 for an autonomous system; pass the longer `period` instead.")
+    if not isinstance(adjoint, dfx.ForwardMode | dfx.DirectAdjoint):
+        raise ValueError(
+            "Argument `adjoint` must be `diffrax.ForwardMode()` or `diffrax.DirectAdjoint()`, but got "
+            f"{type(adjoint).__name__}."
+        )
+    concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, t0, y0, period)))
+    if order is None and not autonomous and not concrete:
+        raise ValueError("Argument `order` must be given under `jit` and `vmap`: finding it out needs concrete values.")
+    newton = dict(tol=tol, max_iterations=max_iterations)
+    search = Search(t0, order, given or None, method, symmetry, backward, segments, pieces, concrete, how, newton)
+    if isinstance(adjoint, dfx.DirectAdjoint) and not concrete:
+        orbit = dense_jacobian(search.run, system, y0, period)
+    else:
+        system = forward_only(
+            system,
+            "`nsjax.find_orbit` was linearised or differentiated in reverse mode (`jax.grad`, `jax.vjp`, "
+            "`jax.linearize`), which needs `adjoint=diffrax.DirectAdjoint()`. Or use `jax.jacfwd`.",
+        )
+        orbit = search.run(system, y0, period)
+    if throw and known(orbit) and not is_okay(orbit.result):
+        last = f"t = {float(orbit.t0):.6g}, {written(orbit.y0)}, period {float(orbit.period):.6g}"
+        raise SolveError(f"{RESULTS[orbit.result]} (The search ended at {last}.)")
+    return raise_if(~is_okay(orbit.result), orbit.result, orbit) if throw else orbit
+
+
+def find_orbits(
+    system: System, starts: StateT, *, period: Any = None, order: int = 1, **options: Any
+) -> list[Orbit[StateT]]:
+    """The different periodic orbits that `find_orbit` finds from many starting points, unstable ones included.
+
+    **Arguments:**
+
+    - `system`: the model.
+    - `starts`: states to start from, leaves with a leading axis.
+    - `period`: autonomous systems: one guess of the period for all, or one each [time]; by default each start is
+        followed to where it settles, which finds what attracts and little else.
+    - `order`, `options`: as for `find_orbit`.
+
+    **Returns:** the orbits, those to which most starts led first; an empty list if there are none. Subharmonics that
+    differ by periods of the forcing only are one orbit.
+    """
+    for name in ("throw", "segments"):
+        if name in options:
+            raise ValueError(f"Argument `{name}` is not for `find_orbits`, but got {options[name]!r}.")
+    count = len(jax.tree.leaves(starts)[0])
+    guesses = None if period is None else jnp.broadcast_to(jnp.asarray(period), (count,))
+
+    def one(start: tuple[Y, Any]) -> Orbit:
+        return find_orbit(system, start[0], period=start[1], order=order, throw=False, **options)
+
+    batch = sweep(one, (starts, guesses))
+    arrays, static = eqx.partition(batch, eqx.is_array)
+    good = np.flatnonzero(np.asarray(is_okay(batch.result)))
+    return distinct_orbits([eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static) for i in good], order)
+
+
+def distinct_orbits(orbits: Sequence[Orbit], order: int = 1) -> list[Orbit]:
+    """Each once, those first that are there most often."""
+    found: list[list[Any]] = []
+    for orbit in orbits:
+        known = next((entry for entry in found if _same(entry[1], entry[2], orbit)), None)
+        if known is None:
+            found.append([1, orbit, _points(orbit, order)])
+        else:
+            known[0] += 1
+    return [orbit for _, orbit, _ in sorted(found, key=lambda entry: -entry[0])]
+
+
+def _points(orbit: Orbit, order: int) -> tuple[np.ndarray, float]:
+    """States of which one is the base point of every orbit that is the same: those a period of the forcing apart, or
+    if there is none many along the way; and how far apart they lie."""
+    if orbit.system.period is not None:
+        ts = orbit.t0 + orbit.period * jnp.arange(order, dtype=orbit.t0.dtype) / order
+        points = np.asarray(jax.vmap(ravel)(orbit.solve(saveat=dfx.SaveAt(ts=ts), throw=False).ys))
+        return points, 1e-6 * (1 + np.abs(points).max())
+    rows = np.asarray(jax.vmap(jax.vmap(ravel))(orbit.path().y))
+    return rows.reshape(-1, rows.shape[-1]), np.linalg.norm(np.diff(rows, axis=1), axis=-1).max()
+
+
+def _same(known: Orbit, along: tuple[np.ndarray, float], orbit: Orbit) -> bool:
+    points, apart = along
+    gap = np.linalg.norm(points - np.asarray(ravel(orbit.y0)), axis=1).min()
+    return bool(abs(known.period - orbit.period) <= 1e-6 * abs(known.period) and gap <= apart)

@@ -1,0 +1,196 @@
+"""Where to begin the search for a periodic orbit."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._types import Scalar, Y
+from ..derivatives._saltation import states
+from ..derivatives._variational import arcs
+from ..flow._results import is_okay, RESULTS
+from ..flow._solve import solve
+from ..system._model import Model
+from ..system._system import clock, relay, sgn, System
+from ._orbit import distance, ravel
+
+
+Relays = dict[str, Int[Array, ""]] | None
+
+
+def base_point(
+    system: System, t0: Scalar, y0: Y, period: Scalar, sign: float, mode: Any, method: dict
+) -> tuple[Y, Scalar, Relays]:
+    """A better guess, from the solution over two and a half guessed periods (backwards if `sign` is -1).
+
+    The base point is in the middle of the longest arc between events, on a smooth one if there is any: the flow map is
+    only one-sided differentiable at an event, and the phase condition wants a transversal section. The period is the
+    time after which the solution comes nearest to it again, among those within half the guess of it. Third, the modes
+    of relays there, which within a hysteresis only the solution knows.
+    """
+    end_time = t0 + sign * 2.5 * period
+    method = method | dict(max_events=3 * method["max_events"])  # which is meant for one period
+    sol = solve(system, t0, end_time, y0, mode=mode, saveat=dfx.SaveAt(dense=True), throw=False, **method)
+    begin, end, _, modes = arcs(sol, t0, y0)
+    begin, end = (jnp.minimum(sign * (t - t0), period) for t in (begin, end))
+    slides = jnp.stack(
+        [modes[:, k] == 0 for k, s in enumerate(system.switches) if isinstance(s, sgn)] or [jnp.zeros(len(begin), bool)]
+    ).any(0)
+    longest = jnp.argmax((end - begin) * jnp.where(slides, 1e-6, 1.0))
+    base = t0 + sign * 0.5 * (begin[longest] + end[longest])
+    here = sol.evaluate(base)
+    share = jnp.linspace(0.5, 1.5, 401, dtype=base.dtype)
+    later = jax.vmap(lambda u: ravel(sol.evaluate(base + sign * u * period)))(share)
+    extent = jnp.max(later, axis=0) - jnp.min(later, axis=0)
+    gap = distance(later / jnp.where(extent == 0, 1, extent), ravel(here) / jnp.where(extent == 0, 1, extent))
+    # Of equally near returns the one nearest to the guess: a user who asks for two laps gets two.
+    best = share[jnp.argmin(gap + 0.05 * jnp.abs(share - 1))]
+    reached = is_okay(sol.result)
+    return here, jnp.where(reached, best, 1) * period, of_relays(system, modes[longest])
+
+
+def of_relays(system: System, mode: Any) -> Relays:
+    """Of a mode of all switches that of the relays, as an argument for `solve`."""
+    return {k.name: mode[i] for i, k in enumerate(system.switches) if isinstance(k, relay)} or None
+
+
+@eqx.filter_jit
+def undecided(system: System, t0: Scalar, y0: Y) -> dict[str, Bool[Array, ""]]:
+    """Which relays are within their hysteresis."""
+    relays = [k for k in system.switches if isinstance(k, relay)]
+    return {k.name: (k.guard(system, t0, y0) <= 0) & (k.off_guard(system, t0, y0) <= 0) for k in relays}
+
+
+def at_start(model: Model, t: Scalar, y: Y, given: Relays = None) -> Any:
+    """The mode by the signs of h, and of relays within their hysteresis that which is given; a surface counts as slid
+    upon."""
+    modes = []
+    for k, switch in enumerate(model.switches):
+        zero = jnp.zeros((), jnp.int32)
+        if isinstance(switch, sgn):
+            h = jnp.min(jnp.stack(model.h(k, t, y)))
+            noise = jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y))
+            zero = jnp.where(jnp.abs(h) <= 1e3 * noise, 0, jnp.sign(h)).astype(jnp.int32)
+        elif isinstance(switch, relay):
+            on, off = (h(model.system, t, y) > 0 for h in (switch.guard, switch.off_guard))
+            zero = jnp.asarray((given or {}).get(switch.name, zero), jnp.int32)
+            zero = jnp.where(on, 1, jnp.where(off, 0, zero))
+        elif isinstance(switch, clock):
+            zero = model.counts(t)[k]
+        modes.append(zero)
+    return states(model, t, y, tuple(modes))
+
+
+@eqx.filter_jit
+def settle_down(
+    system: System, t0: Scalar, y0: Y, sign: float, mode: Any, method: dict
+) -> tuple[Y, Scalar, Bool[Array, ""], Relays]:
+    """Follows the solution (backwards if `sign` is -1) to where it settles; for an autonomous system also the time in
+    which it returns there (0 if it does not), and whether it comes to rest; and the modes of relays there.
+
+    How long that takes is measured in steps of the integration, which know the system's own scale of time.
+    """
+    if system.period is not None:
+        last, at_last, _ = _laps(system, t0, y0, sign, mode, method, 100)
+        period = jnp.asarray(system.period, t0.dtype)
+        return last, period, jnp.zeros((), bool), of_relays(system, at_last)
+    # Only a guess is wanted: a loose tolerance makes long steps, and so the solution is followed farther.
+    loose = 1e-6 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4
+    controller = dfx.PIDController(rtol=loose, atol=loose)
+    big = dict(solver=method["solver"], stepsize_controller=controller, max_steps=2000, max_events=1000)
+    last = solve(system, t0, t0 + sign * 1e9, y0, mode=mode, throw=False, **big)
+    given = tuple(last.mode1) if system.switches else None
+    loop = solve(system, t0, t0 + sign * 1e9, last.y1, mode=given, saveat=dfx.SaveAt(dense=True), throw=False, **big)
+    starts, stops, points, _, steps = loop.dense
+    # Eight points a step: the polynomial between control points bends little.
+    u = jnp.asarray(np.arange(8) / 8, starts.dtype)
+    times = sign * (starts[:, None] + (stops - starts)[:, None] * u).ravel()
+    valid = jnp.repeat(jnp.arange(len(starts), dtype=steps.dtype) < steps, 8)
+    states = jax.vmap(lambda t: ravel(loop.evaluate(t)))(jnp.where(valid, times, t0))
+    here = ravel(last.y1)
+    scale = jnp.max(jnp.where(valid[:, None], jnp.abs(states - here), 0), axis=0)
+    gap = jnp.max(jnp.abs(states - here) / jnp.where(scale == 0, 1, scale), axis=-1)
+    gap = jnp.where(valid, gap, jnp.inf)
+    # The first local minimum of the distance that is small, once the solution has been far away.
+    far = jnp.cumsum(gap > 0.3) > 0
+    near = far & (gap < 0.1)
+    low = near & (gap <= jnp.roll(gap, 1)) & (gap <= jnp.roll(gap, -1))
+    ended = (last.result == RESULTS.max_steps_reached) | (last.result == RESULTS.successful)
+    rests = ended & (jnp.max(scale) <= 1e-4 * (1 + jnp.max(jnp.abs(here))))
+    period = jnp.where(rests, 0, sign * (times[jnp.argmax(low)] - t0))
+    return last.y1, period, rests, of_relays(system, last.mode1)
+
+
+@eqx.filter_jit
+def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
+    """Whether an equilibrium of the sliding field is one of a continuum: on the surfaces that hold it the derivative of
+    the field is singular."""
+    model = Model(system, jnp.ones_like(t0), t0, y)
+    state = at_start(model, t0, y)
+    x, unravel = jfu.ravel_pytree(y)
+    matrix = jax.jacfwd(lambda x: ravel(model.flow(t0, unravel(x), state)))(x)
+    size = jnp.max(jnp.abs(matrix))
+    sticks = jnp.zeros((), bool)
+    for k, switch in enumerate(model.switches):
+        if isinstance(switch, sgn):
+            held = state.mode[k] == 0
+            sticks = sticks | held
+            for i in range(model.parts[k]):
+                # Off the surface, where nothing is asked, it is made regular.
+                n = jax.grad(lambda x, k=k, i=i: model.h(k, t0, unravel(x))[i])(x)
+                n = n / jnp.where(jnp.any(n != 0), jnp.linalg.norm(n), 1)
+                matrix = matrix + jnp.where(held, size, 0) * jnp.outer(n, n)
+    values = jnp.linalg.svd(matrix, compute_uv=False)
+    return sticks & (values[-1] <= 1e-9 * values[0])
+
+
+def held_throughout(system: System, begin: Array, end: Array, modes: Array) -> Bool[Array, ""]:
+    """Whether friction holds a solution along all of its arcs. (At the edge of the continuum it lets go for the root of
+    what rounding is.)"""
+    length = jnp.maximum(end - begin, 0)
+    free = [
+        jnp.sum(jnp.where(modes[:, i] == 0, 0, length)) for i, k in enumerate(system.switches) if isinstance(k, sgn)
+    ]
+    return jnp.any(jnp.asarray(free, length.dtype) <= 1e-3 * jnp.sum(length))
+
+
+@eqx.filter_jit
+def repeats_held(system: System, t0: Scalar, y: Y, period: Scalar, mode: Any, method: dict) -> Bool[Array, ""]:
+    """Whether a state of a forced system comes back, held by friction all the time."""
+    sol = solve(system, t0, t0 + period, y, mode=mode, throw=False, **method)
+    begin, end, _, modes = arcs(sol, t0, y)
+    back = distance(ravel(sol.y1), ravel(y)) <= 1e-8 * (1 + jnp.max(jnp.abs(ravel(y))))
+    return is_okay(sol.result) & back & held_throughout(system, begin, end, modes)
+
+
+def _laps(
+    system: System, t0: Scalar, y0: Y, sign: float, mode: Any, method: dict, number: int
+) -> tuple[Y, tuple, Float[Array, "laps n"]]:
+    """A solution of a forced system after so many periods, its mode, and its states after each: `method` is meant for
+    one."""
+    end = t0 + sign * jnp.asarray(system.period, t0.dtype)
+
+    def lap(here: tuple, _: Any) -> tuple[tuple, Array]:
+        y, mode = here
+        sol = solve(system, t0, end, y, mode=mode if system.switches else None, throw=False, **method)
+        return (sol.y1, tuple(sol.mode1)), ravel(sol.y1)
+
+    first = solve(system, t0, end, y0, mode=mode, throw=False, **method)
+    (last, at_last), later = lax.scan(lap, (first.y1, tuple(first.mode1)), None, length=number - 1)
+    return last, at_last, jnp.concatenate([ravel(first.y1)[None], later])
+
+
+@eqx.filter_jit
+def repeats(system: System, t0: Scalar, y0: Y, sign: float, mode: Any, method: dict, most: int = 16) -> Int[Array, ""]:
+    """After how many periods of the forcing a solution that has settled repeats itself."""
+    _, _, points = _laps(system, t0, y0, sign, mode, method, most)
+    gaps = distance(points, ravel(y0))
+    # What is left of the way to where it settles is small beside the state, and beside how far the points lie apart.
+    extent = 1e-4 * jnp.max(jnp.abs(points)) + 1e-2 * jnp.max(gaps)
+    return 1 + jnp.argmax(gaps <= jnp.maximum(extent, 2 * jnp.min(gaps)))

@@ -1,0 +1,1 @@
+"""Orbits as a boundary-value problem, from event to event."""

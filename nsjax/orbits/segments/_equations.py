@@ -1,0 +1,214 @@
+"""The curve on which the periodic orbits of one course lie when a parameter varies.
+
+The states and times of all events are unknown. So the curve is smooth where the return map is not: at grazing, where a
+segment has no length, and on surfaces that repel.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..._types import Scalar, Y
+from ...system._model import Model, State
+from ...system._parameter import Path
+from ...system._system import impact, relay
+from ._guess import landing
+from ._itinerary import Course, EVENT, FREE, LEAST, Start, TIME
+from ._segment_flow import ALWAYS, FREE_MODES, SegmentFlow, with_parameter
+
+
+VANISHES = 1e-8  # an equation in the units of the unknowns
+
+
+class OrbitCurve(eqx.Module):
+    """The equations; what is unknown is measured in `sizes` (state), `time`, and `width`, the interval of the parameter
+    from `low` on.
+
+    With several parameters (`path` holds their paths, and `low` and `width` are vectors) their orbits are a surface.
+    """
+
+    model: Model
+    path: Path = eqx.field(static=True)
+    like: Y
+    low: Float[Array, "*parameters"]
+    width: Float[Array, "*parameters"]
+    sizes: Float[Array, " n"]
+    time: Scalar
+    guard_sizes: Float[Array, " slots"]  # what a unit of the unknowns makes of each guard
+    order: Int[Array, ""]  # periods of the forcing
+    normal: Float[Array, " n"]  # the phase condition of an autonomous orbit without events
+    reference: Float[Array, " n"]
+    how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    exact: int = eqx.field(static=True)  # which flows are known by their exponentials
+    slides: bool = eqx.field(static=True, default=True)  # whether surfaces hold segments of the course
+
+    def on(self, course: Course) -> "OrbitCurve":
+        """With flows as the modes of a course allow."""
+        return dataclasses.replace(self, slides=any(self.model.holds(course.mode[i]) for i in course.rows))
+
+    @property
+    def flow(self) -> SegmentFlow:
+        exact = self.exact == ALWAYS or (self.exact == FREE_MODES and not self.slides)
+        return SegmentFlow(self.model, self.path, self.like, self.how, exact, self.slides)
+
+    @property
+    def autonomous(self) -> bool:
+        return self.model.system.period is None
+
+    @property
+    def dimension(self) -> int:
+        """That of the curve, or surface: how many parameters vary."""
+        return int(np.size(self.low))
+
+    def unravel(self, x: Array) -> Y:
+        return jfu.ravel_pytree(self.like)[1](x)
+
+    def parts(self, u: Array) -> tuple[Array, Array, Array, Array]:
+        """Times of beginning and end, states at the beginnings, parameter."""
+        n, m = len(self.sizes), self.dimension
+        z = u[:-m].reshape(-1, n + 2)
+        value = self.low + u[-m:].reshape(jnp.shape(self.low)) * self.width
+        return z[:, 0] * self.time, z[:, 1] * self.time, z[:, 2:] * self.sizes, value
+
+    def pack(self, start: Start, value: Any) -> np.ndarray:
+        capacity, n = len(start.course.slot), len(self.sizes)
+        z = np.zeros((capacity, n + 2))
+        for i in range(capacity):
+            j = min(i, len(start.begin) - 1)
+            z[i] = [start.begin[j], start.end[j], *start.x[j]]
+            if i > j:
+                z[i, :2] = start.end[j]
+        z /= np.array([float(self.time)] * 2 + np.asarray(self.sizes).tolist())
+        return np.append(z.ravel(), (np.asarray(value) - self.low) / self.width)
+
+    def state(self, mode: Array, part: Array) -> State:
+        model = self.model
+        several = [n > 1 and not isinstance(k, relay) for n, k in zip(model.parts, model.switches)]
+        parts = tuple(p if on else None for p, on in zip(part, several))
+        return State(tuple(mode), parts, tuple(jnp.zeros((), jnp.int32) for _ in model.switches))
+
+    def guard_rows(self, model: Model, t: Scalar, x: Array, state: State) -> list[list[Scalar]]:
+        """`[slot][part]`; those that no segment asks for are 1."""
+        wanted = tuple(self.slides or not slot.holding for slot in model.slots)
+        return [row or [jnp.ones_like(t)] for row in model.guards(t, self.unravel(x), state, wanted)]
+
+    def guards(self, model: Model, t: Scalar, x: Array, state: State) -> Float[Array, "slots parts"]:
+        return model.stacked(self.guard_rows(model, t, x, state), -jnp.inf)
+
+    def guard(self, model: Model, t: Scalar, x: Array, state: State, slot: Array, entry: Array) -> Scalar:
+        if not model.slots:
+            return jnp.ones_like(t)
+        return self.guards(model, t, x, state)[slot, entry]
+
+    def rate(self, model: Model, t: Scalar, x: Array, state: State, slot: Array, entry: Array) -> Scalar:
+        """How fast a guard changes along the flow."""
+        f = jfu.ravel_pytree(model.flow(t, self.unravel(x), state))[0]
+        along = jax.jvp(lambda t, x: self.guard(model, t, x, state, slot, entry), (t, x), (jnp.ones_like(t), f))
+        return along[1]
+
+    def residual(self, u: Array, course: Course, origin: Array) -> tuple[Array, Scalar, Array]:
+        """What vanishes: for each segment its beginning in time and state, and what ends it. Also the time at which the
+        last segment ends, and the states at the ends."""
+        begin, end, x, value = self.parts(u)
+        rows = len(begin)
+        model = with_parameter(self.model, self.path, value)
+        index = jnp.arange(rows, dtype=course.num.dtype)
+        happened, final = index < course.num, index == course.num - 1
+        mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
+        following = jnp.where(final[:, None], mode[:1], jnp.roll(mode, -1, axis=0))
+
+        def row(a: Scalar, b: Scalar, x: Array, mode: Array, part: Array) -> Array:
+            return self.flow.arrive(a, b, x, value, self.state(mode, part))
+
+        last = jax.vmap(row)(begin, end, x, mode, part)
+
+        def jump(t: Scalar, x: Array, mode: Array, part: Array, after: Array, slot: Array, ends: Array) -> tuple:
+            out = (self.unravel(x), jnp.zeros_like(t))
+            if any(isinstance(switch, impact) for switch in model.switches):
+                switch = jnp.asarray([s.switch for s in model.slots], jnp.int32)[slot]
+                k = jnp.where(ends == EVENT, switch, -1)
+                out = landing(model, k, t, self.unravel(x), self.state(mode, part), tuple(after))
+            return jfu.ravel_pytree(out[0])[0], out[1]
+
+        after, rest = jax.vmap(jump)(end, last, mode, part, following, course.slot, course.ends)
+        before = jnp.where(index == 0, course.num - 1, index - 1)
+        forced = None if self.autonomous else jnp.asarray(model.system.period, end.dtype) * self.order.astype(end.dtype)
+        arrival = (end + rest)[before]
+        anchor = jnp.zeros_like(end[0]) if forced is None else arrival[0] - forced
+        if not self.autonomous:
+            anchor = jnp.where(course.ends[0] == TIME, lax.stop_gradient(origin[0] * self.time), anchor)
+        started = begin - jnp.where(index == 0, anchor, arrival)
+
+        def ended(a: Scalar, b: Scalar, x: Array, last: Array, mode: Array, part: Array, *what: Array) -> Scalar:
+            slot, entry, ends = what
+            state = self.state(mode, part)
+            out = self.guard(model, b, last, state, slot, entry)
+            out = jnp.where(ends == LEAST, self.rate(model, b, last, state, slot, entry) * self.time, out)
+            if model.holdable and model.slots:
+                holding = self.guard(model, a, x, state, slot, entry) + 1
+                for k in model.holdable:
+                    if k not in model.contacts:
+                        here = jnp.asarray([s.switch == k for s in model.slots])[slot]
+                        holding = jnp.where(here, holding - model.bound(k), holding)
+                out = jnp.where(ends == FREE, holding, out)
+            out = out / (jnp.asarray(self.guard_sizes)[slot] if model.slots else 1)
+            closing = self.normal @ (x - self.reference) if forced is None else b - a - forced
+            return jnp.where(ends == TIME, closing, out)
+
+        finish = jax.vmap(ended)(begin, end, x, last, mode, part, course.slot, course.entry, course.ends)
+        # In the units of the unknowns.
+        whole = jnp.concatenate([started[:, None] / self.time, finish[:, None], (x - after[before]) / self.sizes], 1)
+        fill = (u - lax.stop_gradient(origin))[: -self.dimension].reshape(rows, -1)
+        return jnp.where(happened[:, None], whole, fill).ravel(), arrival[0] / self.time, last
+
+
+def guard_sizes(curve: OrbitCurve, start: Start) -> np.ndarray:
+    """What a unit of the unknowns makes of each guard: from their gradients at the beginnings of the segments."""
+
+    @jax.jit
+    def sizes(t: Scalar, x: Array, mode: Array, part: Array) -> Array:
+        state = curve.state(mode, part)
+        by_t, by_x = jax.jacfwd(lambda t, x: curve.guards(curve.model, t, x, state), argnums=(0, 1))(t, x)
+        both = jnp.concatenate([by_t[..., None] * curve.time, by_x * curve.sizes], axis=-1)
+        return jnp.max(jnp.where(jnp.isfinite(both), jnp.abs(both), 0), axis=(-2, -1))
+
+    if not curve.model.slots:
+        return np.zeros(0)
+    rows = start.course.rows
+    seen = [sizes(start.begin[i], start.x[i], start.course.mode[i], start.course.part[i]) for i in rows]
+    # Those of a switch that is held are seen in that mode alone.
+    every = np.stack([np.ones(len(curve.model.switches), np.int32) * m for m in (-1, 0, 1)])
+    seen += [sizes(start.begin[0], start.x[0], mode, start.course.part[0]) for mode in every]
+    found = np.max(np.abs(np.asarray(seen)), axis=0)
+    return np.where(np.isfinite(found) & (found > 0), found, 1.0)
+
+
+def row_sizes(df: Array) -> Array:
+    """A row that vanishes, as at a branch point of one state that is zero, is not made one of rounding."""
+    sizes = jnp.max(jnp.abs(df), axis=1)
+    return jnp.where(sizes < VANISHES, 1, sizes)
+
+
+@eqx.filter_jit
+def state_at(curve: OrbitCurve, value: Array, a: Scalar, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
+    """The state at a time in a segment. (Between steps the states of a `Look` are those of the solver's dense output,
+    less exact than the steps.)"""
+    return curve.flow.arrive(a, t, x, value, curve.state(mode, part))
+
+
+def linearised(curve: OrbitCurve, course: Course, u: Array) -> Array:
+    """The derivatives of the equations, row by row of size one."""
+    return _linearised(curve.on(course), course, u)
+
+
+@eqx.filter_jit
+def _linearised(curve: OrbitCurve, course: Course, u: Array) -> Array:
+    df = jax.jacfwd(lambda v: curve.residual(v, course, u)[0])(u)
+    return df / row_sizes(df)[:, None]

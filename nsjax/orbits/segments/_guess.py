@@ -1,0 +1,176 @@
+"""A periodic orbit cut at its events: what is given of its segments, and guesses of the rest."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..._types import Scalar, Y
+from ...derivatives._saltation import landed, states
+from ...derivatives._variational import arcs
+from ...flow._results import is_okay
+from ...flow._solution import Solution
+from ...flow._solve import solve
+from ...system._model import Model, State
+from ...system._system import System
+from .._guess import base_point
+from ._arcs import model_of, Smooth
+
+
+class Segment(NamedTuple):
+    """One segment of an orbit that is sought: a guess, for `find_orbit(segments=...)`.
+
+    **Attributes:**
+
+    - `mode`: `{"name": value}` for each switch, or one value each; for a single switch its value.
+    - `duration`: about how long it lasts [time].
+    - `ends`: the name of the switch whose event ends it; not needed where the next segment differs in one mode only.
+    - `free`: for a segment that slides on a surface that repels: it may be left at any point. What determines the
+        orbit is that it comes onto the surface tangentially, where |λ| = 1 (section 6.7).
+    """
+
+    mode: Any
+    duration: float
+    ends: str | None = None
+    free: bool = False
+
+
+class Cuts(NamedTuple):
+    """What is given of an orbit: the rows are its segments. Those beyond the last are there to fill up."""
+
+    begin: Float[Array, " rows"]  # guesses
+    end: Float[Array, " rows"]
+    y: Y  # at the beginnings
+    within: State  # the mode, and the components of h that are active, at the beginnings
+    ending: State  # the same at the ends
+    switch: Int[Array, " rows"]  # whose event ends it
+    num: Int[Array, ""]  # the row of the last segment, which ends where the first begins
+    free: tuple[bool, ...]
+
+    def first(self, rows: int) -> "Cuts":
+        cut = jax.tree.map(lambda x: x[:rows], self._replace(num=(), free=()))
+        return cut._replace(num=self.num, free=self.free[:rows])
+
+
+def where(rows: Array, a: Any, b: Any) -> Any:
+    """Row by row."""
+    return jax.tree.map(lambda a, b: jnp.where(rows.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), a, b)
+
+
+def cuts_of(system: System, sol: Solution, t0: Scalar, y0: Y) -> Cuts:
+    """The segments of a solution, up to where it was last in the mode in which it begins."""
+    begin, end, y, modes = arcs(sol, t0, y0)
+    model = model_of(system, t0, y0)
+    events = sol.events
+    index = jnp.arange(len(begin), dtype=events.num.dtype)
+    steady = modes
+    if model.clocks:  # which have gone on
+        steady = modes[:, np.array([k for k in range(modes.shape[1]) if k not in model.clocks], int)]
+    closes = (index <= events.num) & jnp.all(steady == steady[0], axis=1)
+    num = jnp.max(jnp.where(closes, index, 0))
+    last = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), events.y_before, sol.y1)
+    last = where(index < events.num, last, jax.tree.map(lambda x: jnp.broadcast_to(x, (len(begin), *x.shape)), sol.y1))
+
+    def fill(rows: Any, value: Any) -> Any:
+        return where(index <= num, rows, jax.tree.map(lambda r, v: jnp.broadcast_to(v[num], r.shape), rows, value))
+
+    begin, end, y, modes, last = fill(begin, end), fill(end, end), fill(y, last), fill(modes, modes), fill(last, last)
+
+    def state(t: Scalar, y: Y, mode: Array) -> State:
+        return states(model, t, y, tuple(mode))
+
+    switch = jnp.append(events.switch, jnp.asarray(-1, events.switch.dtype))
+    within, ending = jax.vmap(state)(begin, y, modes), jax.vmap(state)(end, last, modes)
+    return Cuts(begin, end, y, within, ending, jnp.where(index < num, switch, -1), num, (False,) * len(begin))
+
+
+def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, how: dict) -> Cuts:
+    """The segments that a user wrote down, each followed in its mode for as long as was said."""
+    names = [k.name for k in system.switches]
+    modes = [_mode(names, s.mode) for s in segments]
+    if not segments:
+        raise ValueError("Argument `segments` must have at least one segment.")
+    if modes[0] != modes[-1]:
+        raise ValueError("Argument `segments` must end in the mode in which it begins: divide the segment in which the "
+                         f"orbit closes in two; but the modes are {modes[0]} and {modes[-1]}.")  # fmt: skip
+    switch = []
+    for i, segment in enumerate(segments[:-1]):
+        changed = [n for n, a, b in zip(names, modes[i], modes[i + 1]) if a != b]
+        ends = segment.ends or (changed[0] if len(changed) == 1 else None)
+        if ends not in names:
+            raise ValueError(
+                f"Argument `segments` must say by `ends=` which switch ends segment {i} (one of {', '.join(names)}), "
+                f"as the modes of {len(changed)} switches change there; but got {segment.ends!r}."
+            )
+        switch.append(names.index(ends))
+    model = model_of(system, t0, y0)
+    for i, segment in enumerate(segments):
+        slides = i < len(switch) and switch[i] in model.holdable and switch[i] not in model.contacts
+        if segment.free and not (slides and modes[i][switch[i]] == 0):
+            raise ValueError(f"Argument `segments` has `free=True` in segment {i}, which must slide on what it leaves.")
+    mode = jnp.asarray(modes, jnp.int32)
+    switch = jnp.asarray([*switch, -1], jnp.int32)
+    durations = jnp.asarray([s.duration for s in segments], t0.dtype)
+
+    def follow(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
+        t, y = carry
+        mode, after, k, duration = row
+        within = states(model, t, y, tuple(mode))
+        y = model.project(t, y, within)
+        end = t + duration
+        y1 = solve(Smooth(model, within), t, end, y, throw=False, **how).y1
+        ending = states(model, end, y1, tuple(mode))
+        y_next, rest = landing(model, k, end, y1, ending, tuple(after))
+        return (end + rest, y_next), (t, end, y, within, ending)
+
+    rows = (mode, jnp.roll(mode, -1, axis=0), switch, durations)
+    _, (begin, end, y, within, ending) = lax.scan(follow, (t0, y0), rows)
+    return Cuts(
+        begin,
+        end,
+        y,
+        within,
+        ending,
+        switch,
+        jnp.asarray(len(segments) - 1, jnp.int32),
+        tuple(s.free for s in segments),
+    )
+
+
+def _mode(names: list[str], mode: Any) -> tuple[int, ...]:
+    if isinstance(mode, Mapping):
+        if set(mode) != set(names):
+            raise ValueError(f"The mode of a segment must name each of the switches {names}, but got {dict(mode)}.")
+        return tuple(int(mode[n]) for n in names)
+    values = tuple(int(m) for m in mode) if isinstance(mode, Sequence) else (int(mode),)
+    if len(values) != len(names):
+        raise ValueError(f"The mode of a segment must have a value for each of the switches {names}, but got {mode}.")
+    return values
+
+
+@eqx.filter_jit
+def cuts_near(
+    system: System, t0: Scalar, y0: Y, period: Scalar, order: int, mode: Any, how: dict
+) -> tuple[Cuts, Bool[Array, ""]]:
+    """The segments of the solution from a guess, and whether it came back to the mode in which it begins."""
+    if system.period is None:
+        y0, period, mode = base_point(system, t0, y0, period, 1.0, mode, how)
+    else:
+        period = jnp.asarray(system.period, t0.dtype) * order
+    sol = solve(system, t0, t0 + period, y0, mode=mode, throw=False, **how)
+    cuts = cuts_of(system, sol, t0, y0)
+    return cuts, is_okay(sol.result) & ((cuts.num > 0) | (sol.events.num == 0))
+
+
+def landing(model: Model, k: Array, t: Scalar, y: Y, ending: State, after: tuple) -> tuple[Y, Scalar]:
+    """The state after the event of switch k (-1: none), and the time up to the state of rest."""
+    out = (y, jnp.zeros_like(t))
+    for i in range(len(model.switches)):
+        hit = landed(model, i, t, y, ending, after)
+        out = jax.tree.map(lambda a, b, now=k == i: jnp.where(now, a, b), hit, out)
+    return out

@@ -1,0 +1,193 @@
+"""What an orbit passes through: its segments, each in a mode, and what ends them."""
+
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..._types import Scalar, Y
+from ...derivatives._saltation import states
+from ...flow._solution import Events
+from ...system._model import Model
+from ...system._system import arrays_of, relay, sgn, System
+from .._orbit import Orbit
+
+
+# What ends a segment: a guard falls to zero; a period has passed (of an orbit without events); a guard is least there
+# (a cut that changes nothing, at which its value is watched); or nothing does: it slides on a surface that repels, onto
+# which it came tangentially (section 6.7).
+EVENT, TIME, LEAST, FREE = range(4)
+
+
+class Course(NamedTuple):
+    """The segments of an orbit in the order of time, cyclic: each begins where the one before it ends.
+
+    Rows beyond the last are there to fill up, so that orbits with different courses are one program's.
+    """
+
+    mode: Int[np.ndarray, "rows switches"]
+    part: Int[np.ndarray, "rows switches"]  # of a surface that holds the segment and has several components: which
+    ends: Int[np.ndarray, " rows"]  # EVENT, TIME, LEAST or FREE
+    slot: Int[np.ndarray, " rows"]  # the guard that ends it
+    entry: Int[np.ndarray, " rows"]  # and its component
+    num: Int[np.ndarray, ""]
+
+    @property
+    def rows(self) -> range:
+        return range(int(self.num))
+
+    def key(self) -> tuple:
+        """The same for equal courses, whatever segment is their first."""
+        n = int(self.num)
+        columns = zip(*(np.asarray(column)[:n].tolist() for column in self[:5]))
+        rows = [tuple(map(str, row)) for row in columns]
+        return min(tuple(rows[i:] + rows[:i]) for i in range(n))
+
+    def take(self, rows: list[int], capacity: int) -> "Course":
+        """These rows (which may occur several times), filled up."""
+        index = np.array(rows + [rows[-1]] * (capacity - len(rows)))
+        mode, part, ends, slot, entry = (np.asarray(column)[index] for column in self[:5])
+        return Course(mode, part, ends, slot, entry, np.asarray(len(rows), np.int32))
+
+
+def same_course(a: Course, b: Course) -> bool:
+    """Whether they are equal row by row."""
+    n = int(a.num)
+    return n == int(b.num) and all(np.array_equal(x[:n], y[:n]) for x, y in zip(a[:5], b[:5]))
+
+
+class Start(NamedTuple):
+    """An orbit with the course that it takes: times and states at the beginnings and ends of its segments."""
+
+    course: Course
+    begin: np.ndarray
+    end: np.ndarray
+    x: np.ndarray
+
+    def filled(self) -> "Start":
+        """With as many rows as programs are compiled for."""
+        return self._replace(course=self.course.take(list(self.course.rows), capacity_for(int(self.course.num))))
+
+
+def capacity_for(segments: int) -> int:
+    """Rows for so many segments: few different numbers, as each is a program to be compiled."""
+    return next(c for c in (4, 8, 16, 32, 64, 128, 256, 512) if c >= segments)
+
+
+def slot_of(model: Model, k: int, holding: bool, part: int) -> int:
+    return next(i for i, s in enumerate(model.slots) if (s.switch, s.holding, s.part) == (k, holding, part))
+
+
+def event_slot(model: Model, k: int, mode: Any, part: int, multiplier: float) -> tuple[int, int]:
+    """The guard, and its component, at whose zero switch k has its event in `mode`: `part` is the component of h that
+    is at zero, `multiplier` the value of the switch if it holds."""
+    if k in model.holdable and model.held(k, mode):
+        return slot_of(model, k, True, 1 if k in model.contacts or multiplier > 0 else -1), 0
+    if isinstance(model.switches[k], sgn) and model.parts[k] > 1 and mode < 0:
+        return slot_of(model, k, False, 0), part
+    return slot_of(model, k, False, 0 if isinstance(model.switches[k], relay) else part), 0
+
+
+class Diary(NamedTuple):
+    """What happens to an orbit in one period: its events, with modes and states before and after each."""
+
+    t: Float[np.ndarray, " events"]
+    switch: Int[np.ndarray, " events"]
+    modes: tuple[Int[np.ndarray, "events switches"], Int[np.ndarray, "events switches"]]
+    states: tuple[Float[np.ndarray, "events n"], Float[np.ndarray, "events n"]]
+
+    @classmethod
+    def of(cls, log: Events) -> "Diary":
+        n = int(log.num)
+        modes, states = (log.mode_before, log.mode_after), (log.y_before, log.y_after)
+        t, switch, modes, states = jax.tree.map(lambda x: np.asarray(x)[:n], (log.t, log.switch, modes, states))
+
+        def flat(y: Y) -> np.ndarray:
+            return np.concatenate([x.reshape(n, math.prod(x.shape[1:])) for x in jax.tree.leaves(y)], axis=1)
+
+        return cls(t, switch, modes, (flat(states[0]), flat(states[1])))
+
+    def joined(self, other: "Diary") -> "Diary":
+        return jax.tree.map(lambda *rows: np.concatenate(rows), self, other)
+
+
+@eqx.filter_jit
+def _looked_at(model: Model, like: Y, systems: System, diaries: Diary) -> tuple[Array, Array, Array]:
+    """At each event of each orbit the component of every h that is nearest to zero, before it and after; and the
+    multiplier of the switch that has it."""
+    unravel = jfu.ravel_pytree(like)[1]
+
+    def nearest(model: Model, t: Scalar, y: Y) -> Array:
+        each = [() if isinstance(s, relay) else model.h(k, t, y) for k, s in enumerate(model.switches)]
+        return jnp.stack([jnp.argmin(jnp.abs(jnp.stack(h))) if len(h) > 1 else jnp.zeros((), int) for h in each])
+
+    def event(system: System, t: Scalar, switch: Array, modes: Any, rows: Any) -> tuple[Array, Array, Array]:
+        here = eqx.tree_at(lambda m: m.system, model, system)
+        before, after = map(unravel, rows)
+        values = here.values(t, before, states(here, t, before, tuple(modes[0])))
+        holdable = jnp.asarray([k in here.holdable for k in range(len(here.switches))])
+        multiplier = jnp.where(holdable, jnp.stack(values), 0)[switch]
+        return nearest(here, t, before), nearest(here, t, after), multiplier
+
+    return jax.vmap(lambda system, diary: jax.vmap(partial(event, system))(*diary))(systems, diaries)
+
+
+def starts_of(model: Model, orbits: list[Orbit]) -> list[Start]:
+    """The courses of orbits of one model that differ in its parameters, from their events."""
+    diaries = [Diary.of(orbit.events) for orbit in orbits]
+    systems = [arrays_of(orbit.system, jnp.float64) for orbit in orbits]
+    at = [(float(orbit.t0), float(orbit.period), np.asarray(orbit.mode, np.int32)) for orbit in orbits]
+    x0 = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(orbit.y0)]) for orbit in orbits]
+    return starts_from(model, orbits[0].y0, systems, diaries, [(*one, x) for one, x in zip(at, x0)])
+
+
+def starts_from(model: Model, like: Y, systems: list[System], diaries: list[Diary], at: list[tuple]) -> list[Start]:
+    """The same from what happens in a period that begins `at` (time, period, mode, state)."""
+    capacity = capacity_for(max(len(diary.t) for diary in diaries))
+    eventful = [i for i, diary in enumerate(diaries) if len(diary.t)]
+    seen = {}
+    if eventful:
+
+        def filled(x: np.ndarray) -> np.ndarray:
+            return np.concatenate([x, np.repeat(x[-1:], capacity - len(x), axis=0)])
+
+        rows = jax.tree.map(lambda *xs: np.stack([filled(x) for x in xs]), *[diaries[i] for i in eventful])
+        stacked = jax.tree.map(lambda *xs: np.stack(xs), *[systems[i] for i in eventful])
+        found = jax.device_get(_looked_at(model, like, stacked, rows))
+        seen = {i: jax.tree.map(lambda x: x[j], found) for j, i in enumerate(eventful)}
+    return [
+        _start(model, diary, seen[i], period) if i in seen else _uneventful(*at[i])
+        for i, (diary, (_, period, _, _)) in enumerate(zip(diaries, at))
+    ]
+
+
+def _uneventful(t0: float, period: float, mode: np.ndarray, x0: np.ndarray) -> Start:
+    none, one = np.zeros((1, len(mode)), np.int32), np.zeros(1, np.int32)
+    course = Course(mode[None], none, one + TIME, one, one, np.asarray(1, np.int32))
+    return Start(course, np.array([t0]), np.array([t0 + period]), x0[None])
+
+
+def _start(model: Model, diary: Diary, seen: tuple, period: float) -> Start:
+    """From each event to the next."""
+    n = len(diary.t)
+    parts_before, parts_after, multipliers = seen
+    guards = []
+    for i in [*range(1, n), 0]:
+        k = int(diary.switch[i])
+        guards.append(event_slot(model, k, diary.modes[0][i, k], int(parts_before[i, k]), float(multipliers[i])))
+    slot, entry = np.array(guards, np.int32).T
+    course = Course(
+        diary.modes[1].astype(np.int32),
+        parts_after[:n].astype(np.int32),
+        np.full(n, EVENT, np.int32),
+        slot,
+        entry,
+        np.asarray(n, np.int32),
+    )
+    return Start(course, diary.t, np.append(diary.t[1:], diary.t[0] + period), diary.states[1])

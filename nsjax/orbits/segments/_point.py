@@ -1,0 +1,321 @@
+"""What is seen of a point of a curve of orbits: its direction, its multipliers, what its guards do along the way."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, RESOLVED
+from ..._numerics._root import find_root
+from ..._types import Scalar
+from ...derivatives._floquet import floquet, structural_zeros
+from ...system._model import Model
+from ...system._system import relay
+from ._equations import OrbitCurve, row_sizes
+from ._itinerary import Course, EVENT, FREE, TIME
+from ._segment_flow import with_parameter
+
+
+TOLERANCE = 1e-12  # of Newton's method, in units of the unknowns
+
+
+class Look(NamedTuple):
+    """All that is seen of a point of the curve.
+
+    - `u`, `tangent`: the unknowns, and the direction of the curve (of a surface, several); `good`: whether it is a
+        point of the curve.
+    - `parameter`, `period`; `begin`, `end`, `x`, `last`: of the segments: times, and states at beginnings and ends.
+    - `factors`: the derivatives from the beginning of each segment to that of the next, at the same time; `monodromy`,
+        `multipliers`, `stable`: what follows.
+    - `rates`: of the guard that ends each segment, there: negative unless it comes to its surface tangentially.
+    - `ends`: value of that guard there.
+    - `margins`: |λ| - b at events that cross a surface which could hold.
+    - `least`, `where`, `most`, `spots`: of each segment and guard the least value, without the zeros that it has at the
+        ends; at which share of the segment; how large it is elsewhere; and the state where it is least.
+    - `low`, `high`: the least and the largest value of each component of the state; `mean`, `square`: its mean and that
+        of its square over time.
+    - `ts`, `xs`: times and states along each segment; `turns_t`, `turns_x`: where in each segment each component of the
+        state is least, and where it is largest.
+    - `branch`: sign and logarithm of the determinant of the equations bordered by the tangent.
+    - `residual`: the largest of the equations.
+    """
+
+    u: Array
+    tangent: Array
+    good: Bool[Array, ""]
+    parameter: Array
+    period: Scalar
+    begin: Array
+    end: Array
+    x: Array
+    last: Array
+    factors: Array
+    monodromy: Array
+    multipliers: Array
+    stable: Bool[Array, ""]
+    rates: Array
+    ends: Array
+    margins: Array
+    least: Array
+    where: Array
+    most: Array
+    spots: Array
+    low: Array
+    high: Array
+    mean: Array
+    square: Array
+    ts: Array
+    xs: Array
+    turns_t: Array
+    turns_x: Array
+    branch: Array
+    residual: Scalar
+
+
+def advance(
+    curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array, newton: Array | bool = True
+) -> Look:
+    """The point of the curve at the distance `s` from `origin` along `border` (of a surface, at several distances along
+    as many directions), and all that is seen of it; or, without
+    `newton`, of the guess itself."""
+
+    return _advance(curve.on(course), course, origin, border, s, guess, np.asarray(newton))
+
+
+@eqx.filter_jit
+def _advance(
+    curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array, newton: Array
+) -> Look:
+    return step_on(curve, course, origin, border, s, guess, newton)
+
+
+def step_on(
+    curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array,
+    newton: Array | bool = True, turns: bool = True,
+) -> Look:  # fmt: skip
+    """`advance`, within a program; without `turns` the largest and least states are those at the nodes."""
+
+    def residual(u: Array, _: Any) -> Array:
+        off = jnp.append(curve.residual(u, course, origin)[0], border @ (u - origin) - s)
+        return jnp.where(newton, off, u - guess)
+
+    u, good = find_root(residual, guess, None, TOLERANCE, 10)
+    return look_at(curve, u, border, course, origin, good, turns)
+
+
+def look_at(
+    curve: OrbitCurve, u: Array, border: Array, course: Course, origin: Array, good: Array, turns: bool
+) -> Look:
+    begin, end, x, value = curve.parts(u)
+    n, rows, m = len(curve.sizes), len(begin), curve.dimension
+    model = with_parameter(curve.model, curve.path, value)
+
+    def equations(u: Array) -> tuple[tuple[Array, Scalar], tuple[Array, Array]]:
+        f, arrival, last = curve.residual(u, course, origin)
+        return (f, arrival), (f, last)
+
+    (df, closing), (f, last) = jax.jacfwd(equations, has_aux=True)(u)
+    scaled = df / row_sizes(df)[:, None]
+    whole = jnp.concatenate([scaled, jnp.atleast_2d(border)])
+    along = jnp.linalg.solve(whole, jnp.eye(len(u), m, m - len(u), dtype=u.dtype)).T
+    if m == 1:
+        along = along / jnp.linalg.norm(along)
+    else:
+        along = jnp.linalg.solve(jnp.linalg.cholesky(along @ along.T), along)
+    branch = jnp.stack(jnp.linalg.slogdet(jnp.concatenate([df, along])))
+    tangent = along.reshape(jnp.shape(border))
+
+    # Derivatives from segment to segment at the same time: the blocks of DF, the moved times eliminated.
+    index = jnp.arange(rows, dtype=course.num.dtype)
+    after = jnp.where(index >= course.num - 1, 0, index + 1)
+    mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
+    field = (
+        jax.vmap(lambda t, x, m, p: jfu.ravel_pytree(model.flow(t, curve.unravel(x), curve.state(m, p)))[0])(
+            begin, x, mode, part
+        )
+        * curve.time
+        / curve.sizes
+    )
+    blocks = df[:, :-m].reshape(rows, n + 2, rows, n + 2)
+    own, on = blocks[index, :, index], blocks[after, :, index]
+    # The next segment of the last one begins where it ends; of a single one it is the same.
+    itself = jnp.zeros(n + 2, u.dtype).at[2:].set(1)
+    on = jnp.where(course.num == 1, on - jnp.diag(itself), on)
+    final = (index == course.num - 1)[:, None]
+    on = on.at[:, 0].set(jnp.where(final, -closing[:-m].reshape(rows, n + 2), on[:, 0]))
+    on = jnp.where((course.ends == TIME)[:, None, None], on.at[:, 0].set(0), on)
+
+    def factor(own: Array, on: Array, ends: Array, last_field: Array) -> Array:
+        # Unknown of a segment: begin, end, x. Its equations: started, finished, continued.
+        by_x, by_end = own[1, 2:], own[1, 1]
+        slope = jnp.where(ends == EVENT, by_end, 1)
+        move = jnp.where(ends == EVENT, -by_x / slope, 0)  # of the end of the segment
+        shift = -(on[0, 1] * move + on[0, 2:])  # of the beginning of the next
+        plain = -(on[2:, 2:] + jnp.outer(on[2:, 1], move))
+        return plain - jnp.outer(last_field, shift)
+
+    factors = jax.vmap(factor)(own, on, course.ends, field[after])
+    factors = factors * curve.sizes[:, None] / curve.sizes[None, :]
+    factors = jnp.where((index < course.num)[:, None, None], factors, jnp.eye(n, dtype=u.dtype))
+
+    zeros = structural_zeros(model.system, jnp.where((index < course.num)[:, None], mode, mode[:1]))
+    found = floquet(factors, zeros, curve.autonomous)
+    free = jnp.any((course.ends == FREE) & (index < course.num))
+    either = zip(_infinitely_unstable(n, curve.autonomous), found)
+    monodromy, multipliers, stable = (jnp.where(free, x, y) for x, y in either)
+
+    # Along the way.
+    inside = (index < course.num)[:, None]
+    along = _along(curve, model, value, begin, end, x, course, turns)
+    least = along.least[:, 2 * n :]
+    low, high = jnp.min(jnp.where(inside, along.least[:, : 2 * n], jnp.inf), axis=0).reshape(2, n)
+    length = jnp.sum(jnp.where(inside[:, 0], end - begin, 0))
+    mean, square = jnp.sum(jnp.where(inside[..., None], along.sums, 0), axis=0) / length
+    period = end[course.num - 1] - begin[0]
+    if not curve.autonomous:
+        period = jnp.asarray(model.system.period, u.dtype) * curve.order.astype(u.dtype)
+    turns_t = begin[:, None] + (end - begin)[:, None] * along.share[:, : 2 * n]
+    rates, values, margins = _at_ends(curve, model, end, last, course)
+    # Beside a branch point rounding moves the root by more than Newton's method is to find it to.
+    wrong = jnp.max(jnp.abs(f))
+    good = (good | (wrong < TOLERANCE)) & jnp.all(jnp.isfinite(tangent))
+    return Look(
+        u, tangent, good, value, period, begin, end, x, last, factors, monodromy, multipliers, stable,
+        rates, values, margins, least, along.share[:, 2 * n :], along.most[:, 2 * n :], along.x[:, 2 * n :], low, -high,
+        mean, square, along.ts, along.xs, turns_t, along.x[:, : 2 * n], branch, wrong,
+    )  # fmt: skip
+
+
+def _infinitely_unstable(n: int, autonomous: bool) -> tuple[Array, Array, Array]:
+    """Monodromy matrix, multipliers, and whether it is stable, of an orbit that slides on a surface that repels."""
+    rest = [1.0] * autonomous + [jnp.nan] * (n - 1 - autonomous)
+    return jnp.full((n, n), jnp.inf), jnp.array([jnp.inf, *rest], complex), jnp.array(False)
+
+
+@eqx.filter_jit
+def extremes(curve: OrbitCurve, course: Course, u: Array) -> tuple[Array, Array]:
+    """The least and the largest value of each component of the state along an orbit."""
+    begin, end, x, value = curve.parts(u)
+    model = with_parameter(curve.model, curve.path, value)
+    found = _along(curve, model, value, begin, end, x, course, turns=True, guards=False).least
+    inside = jnp.arange(len(begin), dtype=course.num.dtype) < course.num
+    low, high = jnp.min(jnp.where(inside[:, None], found, jnp.inf), axis=0).reshape(2, -1)
+    return low, -high
+
+
+def _along(
+    curve: OrbitCurve, model: Model, value: Array, begin: Array, end: Array, x: Array, course: Course, turns: bool,
+    guards: bool = True,
+) -> Minima:  # fmt: skip
+    """Of every segment the least values of the state's components, of their negatives (with `turns` between nodes too),
+    and of the guards, these divided by the zeros that they must have at the ends."""
+    rows, slots = len(begin), len(model.slots) * guards
+    orders = jnp.zeros((rows, 2, 0), x.dtype)
+    if slots:
+        zeros = jnp.asarray(zeros_at_begin(curve, model, course), x.dtype)  # rows, slots
+        here = jnp.arange(slots, dtype=course.slot.dtype) == course.slot[:, None]
+        index = jnp.arange(rows, dtype=course.num.dtype)
+        after = jnp.where(index >= course.num - 1, 0, index + 1)
+        # On what is left freely it comes tangentially.
+        order = jnp.where(course.ends[after] == FREE, 2, 1)[:, None]
+        last = jnp.where((course.ends == EVENT)[:, None] & here, order, 0)
+        orders = jnp.stack([zeros, last.astype(x.dtype)], axis=1)
+    plain = jnp.zeros((rows, 2, 2 * len(curve.sizes)), x.dtype)
+    orders = jnp.concatenate([plain, orders], axis=2)
+    return jax.vmap(lambda *segment: along_segment(curve, model, value, *segment, turns=turns))(
+        begin, end, x, jnp.asarray(course.mode), jnp.asarray(course.part), orders
+    )
+
+
+def along_segment(
+    curve: OrbitCurve, model: Model, value: Array, a: Scalar, b: Scalar, x: Array, mode: Array, part: Array,
+    orders: Array, turns: bool = True,
+) -> Minima:  # fmt: skip
+    """As `_along`, of one segment, with any orders of the zeros."""
+    n, state = len(curve.sizes), curve.state(mode, part)
+    slots = orders.shape[1] - 2 * n
+    slack = jnp.concatenate(
+        [jnp.asarray(size, x.dtype) for size in (curve.sizes, curve.sizes, curve.guard_sizes[:slots])]
+    )
+
+    def sample(first: Scalar, last: Scalar, x: Array) -> tuple[Array, Array, Array]:
+        end = jnp.where(last < 1, a + (b - a) * last, b)
+        return curve.flow.along(a + (b - a) * first, end, x, value, state)
+
+    def rows(t: Scalar, x: Array) -> list[list[Array]]:
+        guards = curve.guard_rows(model, t, x, state) if slots else []
+        return [*([x[i]] for i in range(n)), *([-x[i]] for i in range(n)), *guards]
+
+    places = places_of(jax.eval_shape(rows, a, x))
+
+    def functions(ts: Array, xs: Array) -> tuple[list[Array], Array]:
+        return grouped(jax.vmap(rows)(ts, xs)), RESOLVED * slack[places]
+
+    def below(most: Array) -> Array:
+        # The least value of a guard is of interest where it is about to vanish.
+        return jnp.where(places < 2 * n, jnp.inf if turns else -jnp.inf, 0.1 * most)
+
+    return in_order(minima(sample, functions, x, orders[:, places], below), places)
+
+
+def zeros_at_begin(curve: OrbitCurve, model: Model, course: Course) -> Array:
+    """How many zeros each guard has at the beginning of each segment: that of the surface just left."""
+    index = jnp.arange(len(course.slot), dtype=course.num.dtype)
+    before = jnp.where(index == 0, course.num - 1, index - 1)
+    slot, ends, mode_before = course.slot[before], course.ends[before], jnp.asarray(course.mode)[before]
+    mode = jnp.asarray(course.mode)
+    columns = []
+    switch = jnp.asarray([s.switch for s in model.slots], jnp.int32)[slot]
+    entry = course.entry[before]
+    part = jnp.asarray([s.part for s in model.slots], jnp.int32)[slot]
+    component = jnp.where(entry > 0, entry, jnp.where(part >= 0, part, 0))
+    for s in model.slots:
+        k = s.switch
+        left = (switch == k) & ((ends == EVENT) | (ends == FREE))
+        if s.holding or isinstance(model.switches[k], relay):
+            columns.append(jnp.zeros(len(index)))
+            continue
+        free = jnp.ones(len(index), bool)
+        order = jnp.ones(len(index))
+        if k in model.holdable:
+            free = ~model.held(k, mode[:, k])
+            slid = model.held(k, mode_before[:, k])
+            if k in model.contacts:
+                order = jnp.where(slid, 3, 1)
+            elif not model.static(k):
+                order = jnp.where(slid, 2, 1)
+        if model.parts[k] > 1:  # above, each component is a guard of its own; below, they are one
+            free = free & jnp.where(mode[:, k] > 0, component == s.part, s.part == 0)
+        columns.append(jnp.where(left & free, order, 0))
+    return jnp.stack([c.astype(jnp.result_type(float)) for c in columns], axis=1)
+
+
+def _at_ends(curve: OrbitCurve, model: Model, end: Array, last: Array, course: Course) -> tuple[Array, Array, Array]:
+    """Rate and value of the guard that ends each segment, and |λ| - b where it crosses what could hold it."""
+    if not model.slots:
+        return -jnp.ones_like(end), jnp.zeros_like(end), jnp.ones_like(end)
+    mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
+    final = jnp.arange(len(end), dtype=course.num.dtype) == course.num - 1
+    following = jnp.where(final[:, None], mode[:1], jnp.roll(mode, -1, axis=0))
+
+    def row(t: Scalar, x: Array, m: Array, p: Array, after: Array, slot: Array, entry: Array) -> tuple:
+        state = curve.state(m, p)
+        margin = jnp.full_like(t, jnp.inf)
+        for k in model.holdable:
+            if k in model.contacts:
+                continue
+            here = jnp.asarray([s.switch == k for s in model.slots])[slot] & (m[k] != 0) & (after[k] != 0)
+            held = state._replace(mode=tuple(jnp.where(i == k, 0, mi) for i, mi in enumerate(state.mode)))
+            if model.parts[k] > 1:
+                touched = jnp.where(entry > 0, entry, jnp.asarray([s.part for s in model.slots], jnp.int32)[slot])
+                held = held._replace(part=tuple(touched if i == k else q for i, q in enumerate(held.part)))
+            value = model.values(t, curve.unravel(x), held)[k]
+            margin = jnp.where(here, jnp.abs(value) - model.bound(k), margin)
+        rate = curve.rate(model, t, x, state, slot, entry)
+        return rate, curve.guard(model, t, x, state, slot, entry), margin
+
+    return jax.vmap(row)(end, last, mode, part, following, course.slot, course.entry)

@@ -1,0 +1,225 @@
+"""The flow of one mode from one time to another, with its derivatives: what segments of an orbit are made of.
+
+Where the field of the mode is affine in the state it is the matrix exponential, else steps of the solver; derivatives
+by the state and by the parameter are those of the variational equation, by the times exact.
+"""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._numerics._minima import NODES, THETA, WEIGHTS
+from ..._types import Scalar, Y
+from ...flow._results import is_okay
+from ...flow._solve import solve
+from ...flow.steppers._exponential import affine_parts, expm, generator
+from ...system._model import Model, State
+from ...system._parameter import Path, put_parameter
+from ...system._system import System
+from ._arcs import Smooth
+
+
+NEVER, FREE_MODES, ALWAYS = range(3)  # when a mode's flow is known by its exponential
+
+
+def with_parameter(model: Model, path: Path, value: Array) -> Model:
+    return eqx.tree_at(lambda m: m.system, model, put_parameter(model.system, path, value))
+
+
+class SegmentFlow(eqx.Module):
+    """The flow of each mode of a model, for any value of a parameter (or of several)."""
+
+    model: Model
+    path: Path = eqx.field(static=True)
+    like: Y
+    how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    exact: bool = eqx.field(static=True)
+    slides: bool = eqx.field(static=True)  # whether modes that are held occur
+
+    def unravel(self, x: Array) -> Y:
+        return jfu.ravel_pytree(self.like)[1](x)
+
+    def field(self, t: Scalar, x: Array, value: Array, state: State) -> Array:
+        model = with_parameter(self.model, self.path, value)
+        if self.exact and not self.slides:
+            model = model.within(state.mode)
+            return jfu.ravel_pytree(model.field(t, self.unravel(x), model.signs(t, state)))[0]
+        return jfu.ravel_pytree(model.flow(t, self.unravel(x), state))[0]
+
+    def generator(self, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> tuple:
+        """Of the exact flow from time a to b, see `generator`."""
+        model = with_parameter(self.model, self.path, value)
+        force = model.force(a, self.unravel(x), state) if self.slides else None
+        f = self.field(a, x, value, state)
+        return generator(lambda t, x: self.field(t, x, value, state), a, x, f, b - a, force)
+
+    def arrive(self, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> Array:
+        """The state at time b of the flow from `x` at time a."""
+        return _arrive(self, a, b, x, value, state)
+
+    def along(self, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> tuple[Array, Array, Array]:
+        """Times and states at the nodes `THETA` of the way (between steps they are those of the solver's dense output,
+        less exact than the steps); and the integrals of the state and of its square."""
+        theta = jnp.asarray(THETA, x.dtype)
+        ts = jnp.clip(a + (b - a) * theta, jnp.minimum(a, b), jnp.maximum(a, b))
+        if self.exact:
+            xs = _samples(self, a, b, x, value, state)
+            weights = jnp.asarray(WEIGHTS, x.dtype)[:, None] * (b - a)
+            return ts, xs, jnp.stack([jnp.sum(weights * xs, axis=0), jnp.sum(weights * xs**2, axis=0)])
+        span = jnp.abs(b - a)
+        # Of a segment without length every point is its beginning.
+        far = jnp.where(span > 0, b, jnp.nextafter(a, jnp.inf))
+        none = jax.tree.map(jnp.zeros_like, self.like)
+        saveat = dfx.SaveAt(subs=dfx.SubSaveAt(ts=jnp.where(span > 0, ts, a), fn=lambda t, y, args: y[0]))
+        summed = _Summed(with_parameter(self.model, self.path, value), state)
+        sol = solve(summed, a, far, (self.unravel(x), none, none), saveat=saveat, throw=False, **dict(self.how))
+        xs = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys)
+        sums = jnp.stack([jfu.ravel_pytree(part)[0] for part in sol.y1[1:]])
+        return ts, jnp.where(span > 0, xs, x), jnp.where(span > 0, sums, 0)
+
+
+def exactness(model: Model, t: Scalar, y: Y) -> int:
+    """Which modes have fields that are affine in the state, with a constant matrix."""
+    zero = jnp.zeros((), jnp.int32)
+    parts = tuple(zero if n > 1 else None for n in model.parts)
+    state = State(tuple(zero for _ in model.switches), parts, tuple(zero for _ in model.switches))
+    if not all(affine_parts(lambda t, y: model.field(t, y, model.signs(t, state)), t, y)):
+        return NEVER
+    return ALWAYS if all(affine_parts(lambda t, y: model.flow(t, y, state), t, y)) else FREE_MODES
+
+
+@eqx.filter_jit
+def fits(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> Array:
+    """Whether the forcing along a segment is of a kind that the exponential knows: at several times, as at one where
+    its odd derivatives vanish two frequencies look like one."""
+
+    def at(t: Scalar) -> Array:
+        return flow.generator(t, t + (b - a), x, value, state)[2]
+
+    return jnp.all(jax.vmap(at)(a + (b - a) * jnp.asarray([0.0, 0.2764, 0.6180], x.dtype)))
+
+
+class _Summed(System):
+    """The field of one mode, and the integrals of the state and of its squares."""
+
+    model: Model
+    state: State
+
+    def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
+        y, _, _ = y
+        return self.model.flow(t, y, self.state), y, jax.tree.map(jnp.square, y)
+
+
+class _Varied(System):
+    """A state, the parameter, and the derivatives of the state by those at the beginning, in one mode."""
+
+    model: Model
+    path: Path = eqx.field(static=True)
+    state: State
+
+    def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
+        y, value, columns = y
+
+        def rhs(y: Y, value: Array) -> Y:
+            return with_parameter(self.model, self.path, value).flow(t, y, self.state)
+
+        along, moved = columns
+        change = jax.vmap(lambda dy, dv: jax.jvp(rhs, (y, value), (dy, dv))[1])(along, moved)
+        return rhs(y, value), jnp.zeros_like(value), (change, jnp.zeros_like(moved))
+
+
+def _exponential(
+    flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: State
+) -> tuple[Array, Float[Array, "n n"]]:
+    """The state at the end, and its derivative by that at the beginning."""
+    m, scale, good = flow.generator(a, b, x, value, state)
+    n, e = len(x), expm(m)
+    return jnp.where(good, x + scale * e[:n, n], jnp.nan), e[:n, :n]
+
+
+def _samples(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> Float[Array, "nodes n"]:
+    """States at the nodes: from those at equal distances, with three derivatives, by Hermite's polynomials of degree
+    seven, which miss a 10321920th of the eighth power of the phase between two of them."""
+    m, scale, good = flow.generator(a, b, x, value, state)
+    n, step = len(x), expm(m / NODES)
+    z = jnp.zeros((len(m), 1), x.dtype).at[n, 0].set(1)
+    while z.shape[1] < NODES:
+        z = jnp.concatenate([z, step @ z], axis=1)
+        step = step @ step
+    z = jnp.concatenate([z, step @ z[:, :1]], axis=1)
+    first = m @ z / NODES
+    second = m @ first / NODES
+    third = m @ second / NODES
+    # Where each node lies between which two samples.
+    cell = np.minimum((THETA * NODES).astype(int), NODES - 1)
+    weights = jnp.asarray(_hermite(THETA * NODES - cell), x.dtype)
+    rows = [part[:n, cell + k] for k in (0, 1) for part in (z, first, second, third)]
+    out = sum(w * row for w, row in zip(weights, rows))
+    return jnp.where(good, x[:, None] + scale * out, jnp.nan).T
+
+
+def _hermite(s: np.ndarray) -> np.ndarray:
+    """The polynomials of degree seven that belong to value and three derivatives at 0, and at 1."""
+    powers = np.arange(8)
+    factors = np.cumprod([np.ones(8), powers, powers - 1, powers - 2], axis=0)
+    at_zero = np.eye(4, 8) * factors
+    coefficients = np.linalg.inv(np.concatenate([at_zero, factors]))
+    return (s[:, None] ** powers @ coefficients).T
+
+
+@eqx.filter_custom_jvp
+def _arrive(flow: SegmentFlow, a: Any, b: Any, x: Any, value: Any, state: Any) -> Array:
+    if flow.exact:
+        return _exponential(flow, a, b, x, value, state)[0]
+    smooth = Smooth(with_parameter(flow.model, flow.path, value), state)
+    sol = solve(smooth, a, b, flow.unravel(x), saveat=dfx.SaveAt(t1=True), throw=False, **dict(flow.how))
+    return jnp.where(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0], jnp.nan)
+
+
+@_arrive.def_jvp
+def _arrive_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    """By the variational equation; by the times exactly, as the flow knows no beginning."""
+    flow, a, b, x, value, state = primals
+    _, da, db, dx, dvalue, _ = tangents
+    end, by_x, by_value = _varied(flow, a, b, x, value, state)
+    out = jnp.zeros_like(x)
+    if db is not None:
+        out = out + flow.field(b, end, value, state) * db
+    if dx is not None:
+        out = out + by_x @ dx
+    if da is not None:
+        out = out - by_x @ flow.field(a, x, value, state) * da
+    if dvalue is not None:
+        out = out + by_value @ jnp.ravel(dvalue)
+    return end, out
+
+
+def _varied(
+    flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: State
+) -> tuple[Array, Float[Array, "n n"], Float[Array, "n parameters"]]:
+    """The state at the end, and its derivatives by that at the beginning, and by the parameter."""
+    n = len(x)
+    if flow.exact:
+
+        def end(value: Array) -> tuple[Array, tuple[Array, Array]]:
+            end, by_x = _exponential(flow, a, b, x, value, state)
+            return end, (end, by_x)
+
+        by_value, (out, by_x) = jax.jacfwd(end, has_aux=True)(value)
+        return out, by_x, by_value.reshape(n, -1)
+    eye = jnp.eye(n + value.size, dtype=x.dtype)
+    columns = (jax.vmap(flow.unravel)(eye[:, :n]), eye[:, n:].reshape(-1, *value.shape))
+    varied = _Varied(flow.model, flow.path, state)
+    sol = solve(
+        varied, a, b, (flow.unravel(x), value, columns), saveat=dfx.SaveAt(t1=True), throw=False, **dict(flow.how)
+    )
+    y, _, (along, _) = sol.y1
+    out = jnp.where(is_okay(sol.result), jfu.ravel_pytree(y)[0], jnp.nan)
+    phi = jax.vmap(lambda c: jfu.ravel_pytree(c)[0], out_axes=1)(along)
+    return out, phi[:, :n], phi[:, n:]

@@ -1,0 +1,3 @@
+"""One function for many parameters, in batches."""
+
+from ._sweep import sweep as sweep

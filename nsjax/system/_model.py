@@ -1,0 +1,507 @@
+"""The field in a mode, with the multipliers of the surfaces that hold it, and the guards of the mode.
+
+A mode is one small integer for each switch: for `sgn` the sign +1 or -1 of its region, or 0 while sliding; for
+`relay` 0 or 1; for `impact` 0 in free flight, 1 in resting contact; for `clock` the number of its ticks. There is no
+table of 3^m fields (only where up to four switches meet at one instant are all their combinations tried, in `_settle`):
+being held on m surfaces at once solves m equations for the m multipliers, n_i . f(t, y, λ) + ∂h_i/∂t = 0 for sliding,
+(2.19)-(2.20), and d²h_i/dt² = 0 for contact, whose multiplier is the contact force.
+"""
+
+import functools as ft
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._numerics._autodiff import frozen
+from .._numerics._jaxpr import dependence, is_affine, is_constant
+from .._numerics._linalg import linear_solve, parallel
+from .._types import Mode, Scalar, Y
+from ._system import AbstractSwitch, clock, impact, relay, sgn, System
+
+
+BEYOND = 4  # added, with its sign, to the roots of a switch that is held with |λ| > 1 in backward time
+
+
+class Slot(NamedTuple):
+    """One guard: a function that is positive while the mode lasts."""
+
+    switch: int  # position of its switch
+    part: int  # component of h, or the sign of the bound that λ reaches
+    holding: bool  # whether it watches λ
+
+
+class State(NamedTuple):
+    """A mode, with the component of h that is active on the surface of each switch (None for a smooth surface) and
+    the number of roots at the present instant, to be left out when the next one is sought; of a switch that is held the
+    sign of the bound that its value is at, or 0, and see `Model.edge`."""
+
+    mode: Mode
+    part: tuple[Int[Array, ""] | None, ...]
+    roots: tuple[Int[Array, ""], ...]
+
+
+def _pick(values: tuple[Any, ...], index: Any) -> Any:
+    if index is None or len(values) == 1:
+        return values[0]
+    return jnp.stack(values)[index]
+
+
+class Model(eqx.Module):
+    """A system as the flow sees it: time multiplied by `direction` so that it always increases, and the structure of
+    its switches worked out once while tracing."""
+
+    system: System
+    direction: Any  # +1 or -1
+    switches: tuple[AbstractSwitch, ...] = eqx.field(static=True)
+    parts: tuple[int, ...] = eqx.field(static=True)  # number of components of h, per switch
+    holdable: tuple[int, ...] = eqx.field(static=True)  # switches whose value can hold the solution on their surface
+    contacts: tuple[int, ...] = eqx.field(static=True)  # the impacts among them
+    clocks: tuple[int, ...] = eqx.field(static=True)  # switches that tick
+    jointly_affine: bool = eqx.field(static=True)
+    steady: bool = eqx.field(static=True)  # whether what acts on a surface that can be slid on is constant
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # of `holdable`: whose surfaces may coincide
+    slots: tuple[Slot, ...] = eqx.field(static=True)
+    window: tuple[Scalar, Scalar] | None  # the ticks between which time is kept
+
+    def __init__(self, system: System, direction: Any, t: Scalar, y: Y):
+        self.system = system
+        self.direction = direction
+        self.window = None
+        self.switches = system.switches
+        self.parts = tuple(len(k.components(system, t, y)) for k in self.switches)
+        self.clocks = tuple(k for k, switch in enumerate(self.switches) if isinstance(switch, clock))
+        zeros = tuple(jnp.zeros((), jnp.result_type(t)) for _ in self.switches)
+        one = jnp.ones_like(t)
+
+        def rate(k: int, t: Scalar, y: Y, s: tuple) -> Any:
+            return jax.jvp(lambda t, y: self.h(k, t, y), (t, y), (one, self.field(t, y, s)))[1]
+
+        def second(k: int, s: tuple) -> Any:
+            return jax.jvp(lambda t, y: rate(k, t, y, zeros), (t, y), (one, self.field(t, y, s)))[1]
+
+        def acts(fn: Any, k: int) -> bool:
+            return not is_constant(lambda sk: fn(zeros[:k] + (sk,) + zeros[k + 1 :]), zeros[k])
+
+        def holds(k: int) -> bool:
+            if isinstance(self.switches[k], sgn):
+                return acts(lambda s: rate(k, t, y, s), k)
+            # A contact force that acts on velocities, and so on d²h/dt²; the corner of two walls cannot hold.
+            smooth = isinstance(self.switches[k], impact) and self.parts[k] == 1
+            return smooth and is_constant(lambda s: rate(k, t, y, s), zeros) and acts(lambda s: second(k, s), k)
+
+        self.holdable = tuple(k for k in range(len(self.switches)) if holds(k))
+        self.contacts = tuple(k for k in self.holdable if isinstance(self.switches[k], impact))
+        self.jointly_affine = is_affine(lambda s: self.field(t, y, s), zeros)
+        dry = [k for k in self.holdable if k not in self.contacts]
+
+        def effects(args: tuple[Scalar, Y, tuple]) -> list[Any]:
+            t, y, s = args
+
+            def of(j: int) -> Any:
+                return jax.jvp(
+                    lambda sj: [rate(k, t, y, s[:j] + (sj,) + s[j + 1 :]) for k in dry], (s[j],), (jnp.ones_like(s[j]),)
+                )[1]
+
+            return [of(j) for j in self.holdable]
+
+        self.steady = not dry or is_constant(effects, (t, y, zeros))
+        self.pairs = ()
+        if len(dry) > 1:
+            # Normals of surfaces that coincide are parallel, so that both depend on the same states.
+            seen = [dependence(lambda y, k=k: self.h(k, t, y), y).any(0) for k in dry]
+            self.pairs = tuple(
+                (self.holdable.index(dry[i]), self.holdable.index(dry[j]))
+                for j in range(len(dry))
+                for i in range(j)
+                if (seen[i] & seen[j]).any()
+            )
+        slots = []
+        for k, switch in enumerate(self.switches):
+            number = 1 if isinstance(switch, relay) else self.parts[k]
+            slots += [Slot(k, part, False) for part in range(number)]
+            if k in self.holdable:
+                slots += [Slot(k, sign, True) for sign in ((1,) if k in self.contacts else (1, -1))]
+        self.slots = tuple(slots)
+
+    # Time, which is kept between the ticks of the clocks: at a tick functions of it are taken from the mode's side.
+
+    def within(self, mode: Mode) -> "Model":
+        """The same for a mode, that tells between which ticks it is."""
+        if not self.clocks:
+            return self
+        spans = [self.span(k, mode) for k in self.clocks]
+        low, high = (ft.reduce(pick, ends) for pick, ends in zip((jnp.maximum, jnp.minimum), zip(*spans)))
+        return eqx.tree_at(
+            lambda m: m.window, self, frozen((low, high)), is_leaf=lambda x: x is None or x is self.window
+        )
+
+    def at(self, t: Scalar) -> "Model":
+        """The same for what sets out at time `t`."""
+        zero, counts = jnp.zeros((), jnp.int32), self.counts(t)
+        return self.within(tuple(counts.get(k, zero) for k in range(len(self.switches))))
+
+    def _in(self, state: State) -> "Model":
+        return self if self.window is not None else self.within(state.mode)
+
+    def span(self, k: int, mode: Mode) -> tuple[Scalar, Scalar]:
+        """The last and the next tick of clock k, in the time of the user."""
+        switch = self.switches[k]
+        assert isinstance(switch, clock)
+        return switch.span(self.system, mode[k], jnp.ones((), jnp.result_type(self.direction)))
+
+    def countable(self, t: Scalar) -> Bool[Array, ""]:
+        """Whether the ticks of all clocks can be told apart and counted up to `t`, in the time of the user."""
+        good = jnp.ones((), bool)
+        for k in self.clocks:
+            switch = self.switches[k]
+            assert isinstance(switch, clock)
+            good = good & switch.countable(self.system, t)
+        return good
+
+    def counts(self, t: Scalar) -> dict[int, Int[Array, ""]]:
+        """How often each clock has ticked."""
+        passed = {}
+        for k in self.clocks:
+            switch = self.switches[k]
+            assert isinstance(switch, clock)
+            passed[k] = switch.count(self.system, frozen(t * self.direction), self.direction > 0)
+        return passed
+
+    def tick(self, k: int, mode: Mode) -> Scalar:
+        """When time, increasing as the flow sees it, meets the next tick of clock k."""
+        low, high = self.span(k, mode)
+        return jnp.where(self.direction > 0, high, -low)
+
+    def next_tick(self, mode: Mode) -> Scalar:
+        """The same of the clock that ticks first."""
+        return ft.reduce(jnp.minimum, [self.tick(k, mode) for k in self.clocks])
+
+    def time(self, t: Scalar) -> Scalar:
+        """The time of the user, kept between the ticks of the mode.
+
+        As near to a tick as rounding takes it (and `t % T` or `floor(t / T)` with it) it is put on the right side;
+        beyond, where only a search that has not converged yet goes, it stands still. (By comparisons: to a power series
+        in t a shift is a number, but a maximum of t and the tick is the one or the other.)
+        """
+        t = t * self.direction
+        if self.window is None:
+            return t
+        (low, high), margin = self.window, self.margin(t)
+        shift = jnp.where(t < low + margin, 2 * margin, 0) - jnp.where(t > high - margin, 2 * margin, 0)
+        kept = jnp.where(t < low - margin, low + margin, t + shift)
+        return jnp.where(t > high + margin, high - margin, kept)
+
+    def margin(self, t: Scalar) -> Scalar:
+        """How near to a tick time is within rounding of it; there it is shifted by twice as much."""
+        assert self.window is not None
+        ends = (*self.window, frozen(t))
+        size = ft.reduce(jnp.maximum, [jnp.where(jnp.isfinite(x), jnp.abs(x), 0) for x in ends])
+        return 100 * float(jnp.finfo(t.dtype).eps) * size + float(jnp.finfo(t.dtype).tiny) ** 0.75
+
+    # The smooth field for given switch values, and the indicator functions.
+
+    def field(self, t: Scalar, y: Y, s: tuple[Any, ...]) -> Y:
+        f = self.system.vector_field(self.time(t), y, self.system.values(s))
+        return jax.tree.map(lambda x: x * self.direction, f)
+
+    def h(self, k: int, t: Scalar, y: Y) -> tuple[Scalar, ...]:
+        return self.switches[k].components(self.system, self.time(t), y)
+
+    def bound(self, k: int) -> Any:
+        switch = self.switches[k]
+        assert isinstance(switch, sgn)
+        return switch.bound(self.system)
+
+    def static(self, k: int) -> bool:
+        """Whether switch k has a static friction point, so that it holds beyond |λ| = 1."""
+        switch = self.switches[k]
+        return isinstance(switch, sgn) and switch.breakaway_fn is not None
+
+    def edge(self, k: int, value: Scalar, slack: float) -> Int[Array, ""]:
+        """The sign of the bound that the value of a held `sgn` switch is at, or 0.
+
+        Running backwards, what is held with |λ| > 1 by static friction is let go where |λ| falls to 1, as there the
+        field beside the surface turns round (section 6.7). Which side of 1 it came from is remembered by `BEYOND`.
+        """
+        sign = jnp.sign(value).astype(jnp.int32)
+        edge = jnp.where(jnp.abs(value) >= (1 - slack) * self.bound(k), sign, 0)
+        if self.static(k):
+            edge = edge + jnp.where((self.direction < 0) & (jnp.abs(value) > 1 + slack), BEYOND * sign, 0)
+        return edge
+
+    def held(self, k: int, mode: Any) -> Bool[Array, ""]:
+        """Whether `mode` of switch k holds the solution on its surface."""
+        return mode == (1 if k in self.contacts else 0)
+
+    def holds(self, mode: Any) -> bool:
+        """Whether one of its switches does; of a mode that is known."""
+        return any(bool(self.held(k, mode[k])) for k in self.holdable)
+
+    def level(self, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+        """What its multiplier keeps at zero: the active component of h; for a contact dh/dt, as forces act on that."""
+        self = self._in(state)
+
+        def h(t: Scalar, y: Y) -> Scalar:
+            return _pick(self.h(k, t, y), state.part[k])
+
+        if k not in self.contacts:
+            return h(t, y)
+        zeros = tuple(jnp.zeros((), t.dtype) for _ in self.switches)
+        return jax.jvp(h, (t, y), (jnp.ones_like(t), self.field(t, y, zeros)))[1]
+
+    def rates(self, which: tuple[int, ...], t: Scalar, y: Y, state: State, s: tuple) -> tuple[Scalar, ...]:
+        """The rates of change of `level` for each switch in `which`, for switch values `s`."""
+        self = self._in(state)
+
+        def levels(t: Scalar, y: Y) -> tuple[Scalar, ...]:
+            return tuple(self.level(k, t, y, state) for k in which)
+
+        return jax.jvp(levels, (t, y), (jnp.ones_like(t), self.field(t, y, s)))[1]
+
+    def approach(self, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+        """dh/dt of switch k along the flow (the active component of h)."""
+        self = self._in(state)
+        f = self.flow(t, y, state)
+        return jax.jvp(lambda t, y: _pick(self.h(k, t, y), state.part[k]), (t, y), (jnp.ones_like(t), f))[1]
+
+    def signs(self, t: Scalar, state: State) -> tuple[Any, ...]:
+        """Switch values of a mode, with 0 for those which are held, and for contacts."""
+        return tuple(
+            jnp.zeros((), t.dtype) if isinstance(switch, impact) else m.astype(t.dtype)
+            for switch, m in zip(self.switches, state.mode)
+        )
+
+    def linear(self, t: Scalar, y: Y, state: State, s: tuple) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
+        """Rates of the holdable surfaces at `s`, and their derivatives with respect to the holdable values."""
+        self = self._in(state)
+        which = self.holdable
+
+        def rates(sigma: Float[Array, " m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+            full = list(s)
+            for i, k in enumerate(which):
+                full[k] = sigma[i]
+            out = jnp.stack(self.rates(which, t, y, state, tuple(full)))
+            return out, out
+
+        slope, now = jax.jacfwd(rates, has_aux=True)(jnp.stack([s[k] for k in which]))
+        if self.contacts and len(which) > 1:
+            # Friction along a contact that holds already is free, and so is that of a contact without force: a trace of
+            # compliance gives it the value 0.
+            dry = jnp.asarray([k not in self.contacts for k in which])
+            total, least = jnp.sum(jnp.abs(slope), axis=1), jnp.sqrt(jnp.finfo(t.dtype).tiny)
+            slope -= jnp.diag(jnp.where(dry, jnp.where(total == 0, least, 4 * jnp.finfo(t.dtype).eps * total), 0))
+        return now, slope
+
+    def multipliers(
+        self, slope: Float[Array, "m m"], right: Float[Array, " m"], held: Bool[Array, " m"]
+    ) -> Float[Array, " m"]:
+        """σ with slope σ = right over the holdable switches that are `held`, and 0 for the others.
+
+        Where surfaces coincide (friction elements on one velocity) slope is singular: it determines only the sum of
+        what they do. They share it in proportion to their bounds, |λ_i| / b_i = |λ_j| / b_j, as elastic elements do
+        that yield at the same deflection. No other split holds for longer: all of them reach their bounds together,
+        each in the direction in which it resists, and so when the sum of their strengths is spent.
+        """
+        m, dtype = len(held), slope.dtype
+        matrix = jnp.where(held[:, None] & held[None, :], slope, jnp.eye(m, dtype=dtype))
+        right = jnp.where(held, right, 0)
+        rows = matrix
+        for i, j in self.pairs:
+            same = held[i] & held[j] & parallel(rows[i], rows[j])
+            # In which direction each of them pushes the surface is told by the row, and each of the two rows will do.
+            weights: list[Any] = [0.0] * m
+            weights[i], weights[j] = self.bound(self.holdable[j]), -self.bound(self.holdable[i])
+            share = jnp.where(rows[i] < 0, -1.0, 1.0) * jnp.stack([jnp.asarray(w, dtype) for w in weights])
+            instead = same & (np.arange(m) == j)
+            matrix, right = jnp.where(instead[:, None], share, matrix), jnp.where(instead, 0, right)
+        return linear_solve(matrix, right)
+
+    def values(self, t: Scalar, y: Y, state: State) -> tuple[Any, ...]:
+        """The value of every switch in a mode: signs, and the multipliers λ of those that are held, (2.20)."""
+        self = self._in(state)
+        s = self.signs(t, state)
+        which = self.holdable
+        if not which:
+            return s
+        if len(which) == 1:
+            (k,) = which
+
+            def rate(sk: Scalar) -> Scalar:
+                return self.rates(which, t, y, state, s[:k] + (sk,) + s[k + 1 :])[0]
+
+            zero = jnp.zeros((), t.dtype)
+            r, slope = jax.jvp(rate, (zero,), (jnp.ones_like(zero),))
+            held = self.held(k, state.mode[k])
+            # A vanishing slope off the surface is no fault; on it the quotient is infinite, and so is found.
+            lam = -r / jnp.where(held, slope, 1)
+            return s[:k] + (jnp.where(held, lam, s[k]),) + s[k + 1 :]
+        held = jnp.stack([self.held(k, state.mode[k]) for k in which])
+
+        def put(sigma: Float[Array, " m"]) -> tuple[Any, ...]:
+            full = list(s)
+            for i, k in enumerate(which):
+                full[k] = sigma[i]
+            return tuple(full)
+
+        def newton(_: Any, sigma: Float[Array, " m"]) -> Float[Array, " m"]:
+            r, slope = self.linear(t, y, state, put(sigma))
+            return sigma + self.multipliers(slope, -r, held)
+
+        sigma = jnp.stack([s[k] for k in which])
+        if self.jointly_affine:
+            return put(newton(0, sigma))
+        # Newton's method for a multi-affine field. Friction proportional to a contact force has no say where that is
+        # zero: the search sets out from another value.
+        force = jnp.asarray([k in self.contacts for k in which])
+        return put(lax.fori_loop(0, 6, newton, jnp.where(held & force, 1, sigma)))
+
+    def flow(self, t: Scalar, y: Y, state: State) -> Y:
+        """The right-hand side in a mode; for a sliding one it is Filippov's field (2.19)."""
+        self = self._in(state)
+        return self.field(t, y, self.values(t, y, state))
+
+    def force(self, t: Scalar, y: Y, state: State) -> Scalar:
+        """The largest component of the terms that make up the field: with it those which cancel where it is held."""
+        self = frozen(self._in(state))
+        t, y = frozen((t, y))
+        s = self.values(t, y, state)
+        size = jax.tree.map(jnp.abs, self.field(t, y, s))
+        for k in self.holdable:
+            unit = tuple(jnp.where(i == k, s[k], 0) for i in range(len(s)))
+            pull = jax.jvp(lambda s: self.field(t, y, s), (s,), (unit,))[1]
+            size = jax.tree.map(lambda a, b: a + jnp.abs(b), size, pull)
+        return ft.reduce(jnp.maximum, [jnp.max(x) for x in jax.tree.leaves(size)])
+
+    def project(self, t: Scalar, y: Y, state: State) -> Y:
+        """Removes the drift off the surfaces that hold the solution.
+
+        The state moves along ∂f/∂s, the direction in which the switch acts, so that the result does not depend on the
+        units of the state; positions move along what this is in a unit of time. One Newton step: exact when h is
+        affine, else quadratic in a drift that is itself of the order of the local error.
+        """
+        which = self.holdable
+        if not which:
+            return y
+        self = self._in(state)
+        s = self.values(t, y, state)
+        held = jnp.stack([self.held(k, state.mode[k]) for k in which])
+        _, slope = self.linear(t, y, state, s)
+
+        def push(y: Y, gaps: list[Scalar]) -> Y:
+            """∂f/∂s times the values which close the gaps."""
+            move = self.multipliers(slope, -jnp.stack(gaps), held)
+            ds = [jnp.zeros_like(v) for v in s]
+            for i, k in enumerate(which):
+                ds[k] = jnp.where(held[i], move[i], 0)
+            return jax.jvp(lambda s: self.field(t, y, s), (s,), (tuple(ds),))[1]
+
+        if self.contacts:
+            gaps = [self.h(k, t, y)[0] if k in self.contacts else jnp.zeros_like(t) for k in which]
+            dq = jax.jvp(lambda y: self.field(t, y, s), (y,), (push(y, gaps),))[1]
+            y = jax.tree.map(jnp.add, y, dq)
+        return jax.tree.map(jnp.add, y, push(y, [self.level(k, t, y, state) for k in which]))
+
+    # Guards: positive while the mode lasts. Slot i is the maximum over the last axis, so that the event is the
+    # instant at which all of its entries have become non-positive.
+
+    @property
+    def width(self) -> int:
+        return max(self.parts, default=1)
+
+    def guards(
+        self, t: Scalar, y: Y, state: State, wanted: tuple[bool, ...] | None = None, s: tuple[Any, ...] | None = None
+    ) -> list[list[Scalar]]:
+        """`guards[slot][part]` (of the slots that are `wanted`, else empty), as scalars: stacked arrays of two or
+        five cost XLA's CPU code several times as much. `s`: the values of the switches, if they are known."""
+        self = self._in(state)
+        one = jnp.ones((), t.dtype)
+        wanted = (True,) * len(self.slots) if wanted is None else wanted
+        if s is None:
+            s = self.values(t, y, state) if any(w and slot.holding for w, slot in zip(wanted, self.slots)) else ()
+        rows = []
+        for slot, want in zip(self.slots, wanted):
+            if not want:
+                rows.append([])
+                continue
+            k, switch, mode = slot.switch, self.switches[slot.switch], state.mode[slot.switch]
+            if slot.holding:
+                left = s[k] if k in self.contacts else self.bound(k) - slot.part * s[k]
+                if self.static(k):
+                    left = jnp.where(state.roots[k] * slot.part <= -BEYOND, -slot.part * s[k] - 1, left)
+                row = [jnp.where(self.held(k, mode), left, one)]
+            elif isinstance(switch, relay):
+                on = switch.guard(self.system, self.time(t), y)
+                off = switch.off_guard(self.system, self.time(t), y)
+                row = [-jnp.where(mode == 1, off, on)]
+            elif isinstance(switch, clock):
+                low, high = self.span(k, state.mode)
+                left = jnp.where(self.direction > 0, high - t * self.direction, t * self.direction - low)
+                there = jnp.isfinite(jnp.where(self.direction > 0, high, low))
+                row = [jnp.where(there, left, one)]
+            elif isinstance(switch, impact):
+                gap = self.h(k, t, y)[slot.part]
+                row = [jnp.where(mode == 1, one, gap) if k in self.contacts else gap]
+            elif self.parts[k] == 1:
+                row = [jnp.where(mode == 0, one, mode.astype(t.dtype) * self.h(k, t, y)[0])]
+            else:
+                row = self._corner_guard(slot, t, y, state)
+            rows.append(row)
+        return rows
+
+    def stacked(self, rows: list[list[Any]], filler: float) -> Array:
+        """The same as an array `(slots, parts, ...)`; slots with fewer parts are filled up."""
+        like = jnp.full_like(rows[0][0], filler)
+        return jnp.stack([jnp.stack(row + [like] * (self.width - len(row))) for row in rows])
+
+    def _corner_guard(self, slot: Slot, t: Scalar, y: Y, state: State) -> list[Scalar]:
+        """h = min(h_1, ..., h_J). Where h > 0 each component is watched alone; where h < 0 the event is the instant at
+        which the last of them becomes positive; while sliding on one, the others end the surface at its tip."""
+        k, j = slot.switch, slot.part
+        h, mode, part = self.h(k, t, y), state.mode[k], state.part[k]
+        one = jnp.ones((), t.dtype)
+        alone = jnp.where((mode == 0) & (part == j), one, h[j])
+        if j == 0:
+            return [jnp.where(mode < 0, -h[0], alone)] + [jnp.where(mode < 0, -hi, -one) for hi in h[1:]]
+        return [jnp.where(mode < 0, one, alone)]
+
+    def known_roots(self, state: State) -> list[list[Int[Array, ""]]]:
+        """How many roots each guard has at the present instant (just left, so not to be found again)."""
+        rows = []
+        none = jnp.zeros((), jnp.int32)
+        for k, j, holding in self.slots:
+            roots, mode, part = state.roots[k], state.mode[k], state.part[k]
+            if k in self.holdable:
+                held = self.held(k, mode)
+                if holding:
+                    at = (roots == j) | (roots == j * (BEYOND + 1)) if self.static(k) else roots == j
+                    rows.append([jnp.where(held & at, 1, none)])
+                    continue
+                roots = jnp.where(held, none, roots)
+            if part is None:
+                row = [roots]
+            elif isinstance(self.switches[k], impact):
+                row = [jnp.where(part == j, roots, none)]
+            elif j == 0:
+                row = [jnp.where((part == 0) | (mode < 0) & (part == i), roots, none) for i in range(self.parts[k])]
+                row[1:] = [jnp.where(mode < 0, r, none) for r in row[1:]]
+            else:
+                row = [jnp.where((mode >= 0) & (part == j), roots, none)]
+            rows.append(row)
+        return rows
+
+    def sizes(self, fn: Any, t: Scalar, y: Y, dt: Scalar, dy: Y) -> Array:
+        """Sums of the absolute values of the terms of d`fn` for changes `dt` and `dy`, whatever they cancel to."""
+        flat, unravel = jfu.ravel_pytree(y)
+        by_t, by_y = jax.jacfwd(lambda t, y: jnp.stack(fn(t, unravel(y))), argnums=(0, 1))(t, flat)
+        return jnp.abs(by_t * dt) + jnp.sum(jnp.abs(by_y * jfu.ravel_pytree(dy)[0]), axis=-1)
+
+    def rounding(self, fn: Any, t: Scalar, y: Y, size: Y | None = None) -> Array:
+        """What rounding of time and state alone can make of the entries of `fn(t, y)`: below it they count as zero.
+        `size`: that of the terms of which the state is the sum, if they may cancel."""
+        return 8 * jnp.finfo(t.dtype).eps * self.sizes(fn, t, y, t, y if size is None else size)
