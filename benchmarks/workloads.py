@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "references"))
 import reference
 
 

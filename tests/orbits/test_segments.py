@@ -6,8 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from models import Motion, pid
-from test_contact import TableBall
+from models import Motion, pid, TableBall
 
 import nsjax
 from nsjax import find_orbit, gallery, RESULTS, Segment

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_plot_branch import branch_of, special_at
+from branches import branch_of, special_at
 
 import nsjax
 from nsjax import gallery, RESULTS

@@ -9,13 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from models import Motion, pid
+from models import CHEAP, Motion, pid
 
 import nsjax
 from nsjax import gallery, RESULTS, solve
-
-
-CHEAP = dict(solver=dfx.Heun(), stepsize_controller=pid(1e-4))  # quick to compile; accuracy is not the point
 
 
 def one(v_dr, x=2.5, **kwargs):

@@ -1,13 +1,11 @@
 """Nothing for nothing: a model pays only for what it contains, read off its jaxpr."""
 
-import collections
-
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import pytest
-from jax.extend.core import ClosedJaxpr, Jaxpr
 from models import Motion
+from programs import count
 
 import nsjax
 from nsjax import solve
@@ -75,19 +73,6 @@ class Idle(nsjax.System):
     @nsjax.sgn
     def side(self, t, y):
         return y.x
-
-
-def count(jaxpr, into=None):
-    """How often each primitive occurs, in all nested jaxprs too."""
-    into = collections.Counter() if into is None else into
-    for eqn in jaxpr.eqns:
-        into[eqn.primitive.name] += 1
-        for value in jax.tree.leaves(eqn.params, is_leaf=lambda x: isinstance(x, (Jaxpr, ClosedJaxpr))):
-            if isinstance(value, ClosedJaxpr):
-                count(value.jaxpr, into)
-            elif isinstance(value, Jaxpr):
-                count(value, into)
-    return into
 
 
 def primitives(system, derivative=lambda fn: fn, **kwargs):

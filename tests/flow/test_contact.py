@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import reference
 from jaxtyping import Array
-from models import flat, Motion, pid
+from models import flat, Motion, pid, TableBall
 
 import nsjax
 from nsjax import gallery, RESULTS, solve
@@ -111,26 +111,6 @@ def test_lift_off():
     np.testing.assert_allclose(flat(sol.y1), [p.r / p.m * free**3 / 6, p.r / p.m * free**2 / 2], rtol=1e-11)
     derivative = jax.jacfwd(lambda g: jnp.stack(solve(Rising(g=g), 0.0, t1, Motion(0.0, 0.0), **TIGHT).y1))(p.g)
     np.testing.assert_allclose(derivative, [-(free**2) / 2, -free], rtol=1e-9)
-
-
-class TableBall(nsjax.System):
-    """`reference.ball_on_table`: lands, bounces, rests, lifts off and lands again."""
-
-    a: float = 1.2
-    w: float = 1.0
-    g: float = 1.0
-    e: float = 0.4
-
-    def vector_field(self, t, y, s):
-        return Motion(y.v, -self.g + s.table)
-
-    @nsjax.impact
-    def table(self, t, y):
-        return y.x - self.a * jnp.cos(self.w * t)
-
-    @table.restitution
-    def table(self):
-        return self.e
 
 
 def test_ball_on_an_oscillating_table():

@@ -5,8 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import Circle, flat, Motion, pid, Plane
-from test_grazing import impact, Touch
+from models import Circle, flat, impact, Motion, pid, Plane, Touch
 
 from nsjax import gallery, RESULTS, sensitivity, solve
 

@@ -5,11 +5,9 @@ import dataclasses
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from branches import branch_of, special_at
 
-import nsjax
 from nsjax import gallery, plot
-from nsjax.continuation.orbits._bifurcation import OrbitBifurcation
-from nsjax.continuation.orbits._branch import OrbitBranch
 
 
 LABELS = {"omega": "ω [rad/s]", "v_dr": "v [m/s]", "x": "x [m]", "v": "x' [m/s]"}
@@ -19,35 +17,6 @@ LABELS = {"omega": "ω [rad/s]", "v_dr": "v [m/s]", "x": "x [m]", "v": "x' [m/s]
 def closed():
     yield
     plt.close("all")
-
-
-def special_at(kind, value, before, after=None, **changes):
-    """A corner from one pair of multipliers to another, or a smooth point."""
-    matrices = np.diag(before), np.diag(before if after is None else after)
-    finite = np.all(np.isfinite(matrices))
-    crossings = nsjax.eigenvalue_crossings(*matrices, multipliers=True) if after is not None and finite else []
-    sides = tuple(np.array(sorted(np.diag(m), key=lambda z: -abs(z)), complex) for m in matrices)
-    fields = dict(
-        kind=kind, discontinuous=after is not None, criticality=None, evidence="both", by_count=kind, by_crossing=None,
-        transition=None, parameter="omega", value=value, period=6.0, t=0.0, y=gallery.Motion(1.0, 0.0),
-        count=((1,), (1,)), surfaces=(), multipliers=sides, monodromies=matrices, crossings=crossings, halves=[],
-    )  # fmt: skip
-    return OrbitBifurcation(**fields | changes)
-
-
-def branch_of(system, parameter, values, heights, multipliers, special=(), indices=(), others=()):
-    values, heights = np.array(values, float), np.array(heights, float)
-    multipliers = np.array(multipliers, complex)
-    moduli = np.abs(multipliers)
-    n = len(values)
-    return OrbitBranch(
-        system=system, parameter=parameter, values=values, periods=np.full(n, 6.0), orders=np.ones(n, int),
-        ts=np.zeros(n), ys=gallery.Motion(0.5 * heights, np.zeros(n)), low=gallery.Motion(-heights, -2 * heights),
-        high=gallery.Motion(0.5 * heights, heights), mean=gallery.Motion(np.zeros(n), np.zeros(n)),
-        multipliers=multipliers, stable=np.all(moduli <= 1, axis=1), itineraries=("",) * n, special=tuple(special),
-        indices=tuple(indices), ends=("", ""), others=tuple(others), admissible=np.ones(n, bool),
-        segments=((),) * n, records={"top": heights, "rows": np.zeros((n, 2))},
-    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import Array
-from models import flat, Motion
-from test_vmap import CHEAP
+from models import CHEAP, flat, Motion
 
 import nsjax
 from nsjax import gallery, sweep

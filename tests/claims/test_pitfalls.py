@@ -13,9 +13,9 @@ import pytest
 import reference
 from jax import Array
 from models import flat, itinerary, Motion, Point, times, Toggle
+from programs import count
 from scipy.linalg import expm
 from scipy.optimize import brentq
-from test_cost import count
 
 import nsjax
 from nsjax import gallery, RESULTS, solve

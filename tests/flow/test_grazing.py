@@ -5,28 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import Motion, pid
+from models import impact, Motion, pid, Touch
 
 import nsjax
 from nsjax import RESULTS, solve
-
-
-class Touch(nsjax.System):
-    """x = cos t from t = -π on, with a wall at 1 + gap, which it touches at t = 0 if gap = 0."""
-
-    gap: float = 0.0
-    e: float = 0.5
-
-    def vector_field(self, t, y, s):
-        return Motion(y.v, -y.x - s.wall)
-
-    @nsjax.impact
-    def wall(self, t, y):
-        return 1 + self.gap - y.x
-
-    @wall.restitution
-    def wall(self):
-        return self.e
 
 
 class Graze(Touch):
@@ -46,15 +28,6 @@ def run(system):
         system, -np.pi, 3.0, Motion(-1.0, 0.0), solver=dfx.Dopri8(), stepsize_controller=pid(1e-12), throw=False
     )
     return jnp.stack(sol.y1), sol.result, sol.events
-
-
-def impact(gap, e=0.5):
-    """State at t = 3 in closed form."""
-    wall = 1 + gap
-    hit = jnp.arccos(jnp.minimum(wall, 1.0))
-    v = -e * jnp.sin(hit)
-    late = 3.0 + hit
-    return jnp.stack([wall * jnp.cos(late) + v * jnp.sin(late), -wall * jnp.sin(late) + v * jnp.cos(late)])
 
 
 @pytest.mark.parametrize("gap", [1e-3, 1e-9])

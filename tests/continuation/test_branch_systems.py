@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from branches import orbit_of, same_multipliers, stability_agrees, the
 from models import Heat, Motion, Support, Thermostat
 from scipy.optimize import fsolve
-from test_continue_orbit import orbit_of, same_multipliers, stability_agrees, the
 
 import nsjax
 from nsjax import continue_orbit

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from test_cli import run
+from command_line import run
 
 import nsjax
 from nsjax import __main__ as command, _cli

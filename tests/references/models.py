@@ -331,3 +331,53 @@ class Stop(nsjax.System):
     @property
     def period(self):
         return 2 * jnp.pi / self.omega
+
+
+CHEAP = dict(solver=dfx.Heun(), stepsize_controller=pid(1e-4))  # quick to compile; accuracy is not the point
+
+
+class TableBall(nsjax.System):
+    """`reference.ball_on_table`: lands, bounces, rests, lifts off and lands again."""
+
+    a: float = 1.2
+    w: float = 1.0
+    g: float = 1.0
+    e: float = 0.4
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -self.g + s.table)
+
+    @nsjax.impact
+    def table(self, t, y):
+        return y.x - self.a * jnp.cos(self.w * t)
+
+    @table.restitution
+    def table(self):
+        return self.e
+
+
+class Touch(nsjax.System):
+    """x = cos t from t = -π on, with a wall at 1 + gap, which it touches at t = 0 if gap = 0."""
+
+    gap: float = 0.0
+    e: float = 0.5
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - s.wall)
+
+    @nsjax.impact
+    def wall(self, t, y):
+        return 1 + self.gap - y.x
+
+    @wall.restitution
+    def wall(self):
+        return self.e
+
+
+def impact(gap, e=0.5):
+    """State at t = 3 in closed form."""
+    wall = 1 + gap
+    hit = jnp.arccos(jnp.minimum(wall, 1.0))
+    v = -e * jnp.sin(hit)
+    late = 3.0 + hit
+    return jnp.stack([wall * jnp.cos(late) + v * jnp.sin(late), -wall * jnp.sin(late) + v * jnp.cos(late)])

@@ -1,25 +1,18 @@
 """Branches of periodic orbits through the bifurcations of chapter 6, against 40-digit references."""
 
-import dataclasses
-
 import branch_reference
-import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import Motion, pid, Stop
+from branches import orbit_of, same_multipliers, stability_agrees, the
+from models import Motion, Stop
 
 import nsjax
-from nsjax import continue_orbit, find_orbit, gallery
+from nsjax import continue_orbit, gallery
 
 
 POINTS = branch_reference.POINTS
-
-
-def orbit_of(system, y0, **options):
-    method = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-12), max_steps=8192, max_events=16)
-    return find_orbit(system, y0, **(method | options))
 
 
 @pytest.fixture(scope="module")
@@ -50,57 +43,8 @@ def trilinear():
     return continue_orbit(system, orbit_of(system, Motion(-0.1, -0.7)), "omega", (0.5, 2.0))
 
 
-def the(branch, value, tolerance=1e-8):
-    """The special point there."""
-    found = [b for b in branch.special_points if abs(b.value - value) < tolerance]
-    assert found, f"none at {value} among {[b.value for b in branch.special_points]}"
-    return found[0]
-
-
-def same_multipliers(found, want, tolerance=1e-6):
-    """Both sides, in either order, and pairs in either order."""
-
-    def listed(side):
-        return sorted(np.round(np.asarray(side, complex), 12), key=lambda z: (-abs(z), z.imag))
-
-    def close(a, b):
-        pairs = list(zip(listed(a), listed(b), strict=True))
-        return all(abs(x - y) < tolerance if np.isfinite(y) else np.isinf(x) for x, y in pairs)
-
-    first, second = want
-    a, b = found
-    assert (close(a, first) and close(b, second)) or (close(a, second) and close(b, first)), (found, want)
-
-
 def sides(name, *which):
     return tuple(POINTS[name].multipliers[side] for side in which)
-
-
-def stability_agrees(branch, number, seed, laps=40):
-    """Orbits at random points of the branches, perturbed, return or leave."""
-    generator = np.random.default_rng(seed)
-    tried = 0
-    for part in branch.branches:
-        rho = np.abs(np.asarray(part.multipliers))
-        if part.system.period is None:
-            trivial = np.argmin(np.abs(rho - 1), axis=1)
-            rho = np.where(np.arange(rho.shape[1]) == trivial[:, None], 0, rho)
-        rho = rho.max(axis=1)
-        for i in generator.permutation(len(part))[:number]:
-            if 0.8 < rho[i] < 1.2:
-                continue  # too slow to tell
-            here = dataclasses.replace(part.system, **{part.parameter: float(part.values[i])})
-            y0 = jax.tree.map(lambda leaf, i=i: jnp.asarray(leaf[i]), part.ys)
-            t0, period = float(part.ts[i]), float(part.periods[i])
-            moved = jax.tree.map(lambda leaf: leaf + 1e-7, y0)
-            end = nsjax.solve(
-                here, t0, t0 + laps * period, moved, solver=dfx.Tsit5(), stepsize_controller=pid(1e-11),
-                max_steps=100_000, max_events=1000, throw=False,
-            )  # fmt: skip
-            away = max(abs(float(a) - float(b)) for a, b in zip(end.y1, y0))
-            assert (away < 1e-6) == bool(part.stable[i]), (part.values[i], rho[i], away)
-            tried += 1
-    return tried
 
 
 def test_infinitely_unstable_fold(stick_slip):

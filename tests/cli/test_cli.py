@@ -1,7 +1,5 @@
 """The command line, in this process: tables, pictures, JSON, and one line for every mistake."""
 
-import contextlib
-import io
 import json
 import pathlib
 import re
@@ -10,6 +8,7 @@ import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from command_line import run
 from scipy.integrate import solve_ivp
 
 import nsjax
@@ -19,18 +18,7 @@ from nsjax._cli._units import notes, ratio
 
 
 PERIOD = 10 + np.pi + 2 * np.arctan(1 / 5)  # of the stick-slip orbit
-README = pathlib.Path(__file__).parents[1] / "README.md"
-
-
-def run(*argv):
-    """Exit status, standard output and standard error."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            status = command.main(list(map(str, argv)))
-        except SystemExit as stop:  # from argparse
-            status = stop.code
-    return status, out.getvalue(), err.getvalue()
+README = pathlib.Path(__file__).parents[2] / "README.md"
 
 
 def check_stick_slip_orbit(orbit):

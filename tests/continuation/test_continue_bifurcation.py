@@ -249,7 +249,7 @@ def slip(tau, c, x, v):
 def test_infinitely_unstable_folds():
     """Section 6.7, as README has it: the mass comes back to the belt just as this could hold it with the slip force."""
     blocks = re.findall(
-        r"```python\n(.*?)```", (pathlib.Path(__file__).parents[1] / "README.md").read_text(), re.DOTALL
+        r"```python\n(.*?)```", (pathlib.Path(__file__).parents[2] / "README.md").read_text(), re.DOTALL
     )
     (block,) = [b for b in blocks if "continue_bifurcation" in b]
     shown: dict[str, Any] = dict(nsjax=nsjax)

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 
-PACKAGE = pathlib.Path(__file__).parents[1] / "nsjax"
+PACKAGE = pathlib.Path(__file__).parents[2] / "nsjax"
 
 # Bottom to top: a folder imports only those named before it.
 ORDER = (
@@ -35,7 +35,7 @@ ORDER = (
 
 def files(name):
     folder = PACKAGE / name
-    return sorted(folder.glob("*.py")) if folder.is_dir() else [PACKAGE / f"{name}.py"]
+    return sorted(folder.rglob("*.py")) if folder.is_dir() else [PACKAGE / f"{name}.py"]
 
 
 def imported(path):
