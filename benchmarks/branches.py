@@ -66,7 +66,7 @@ def one_by_one(orbit: nsjax.Orbit, max_step: float, repeats: int) -> Row:
     seconds, first = [], 0.0
     points: list[Any] = []
     for i in range(repeats + 1):
-        growth = nsjax.OrbitGrowth(orbit.system, orbit, "omega", OMEGA, max_step=max_step)
+        growth = nsjax.OrbitContinuation(orbit.system, orbit, "omega", OMEGA, max_step=max_step)
         wall, start = time.perf_counter(), time.process_time()
         points = list(growth)
         if i == 0:

@@ -29,7 +29,7 @@ from .continuation import (
     continue_orbits as continue_orbits,
     hopf_orbits as hopf_orbits,
     OrbitBranch as OrbitBranch,
-    OrbitGrowth as OrbitGrowth,
+    OrbitContinuation as OrbitContinuation,
 )
 from .derivatives import (
     fundamental_matrix as fundamental_matrix,

@@ -11,5 +11,5 @@ from .equilibria._continue_equilibrium import continue_equilibrium as continue_e
 from .equilibria._hopf_orbits import hopf_orbits as hopf_orbits
 from .orbits._bifurcation import OrbitBifurcation as OrbitBifurcation, OrbitHalf as OrbitHalf
 from .orbits._branch import OrbitBranch as OrbitBranch
-from .orbits._continue_orbit import continue_orbit as continue_orbit, OrbitGrowth as OrbitGrowth
+from .orbits._continue_orbit import continue_orbit as continue_orbit, OrbitContinuation as OrbitContinuation
 from .orbits.batch._continue_orbits import continue_orbits as continue_orbits, OrbitBranches as OrbitBranches

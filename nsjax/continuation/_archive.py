@@ -23,7 +23,7 @@ from .._types import Y
 from ..system._system import arrays_of, System
 
 
-FORMAT = 1
+FORMAT = 2  # 1: with names of types that are no more
 KINDS = "biufc"  # of the dtypes that may occur
 KEYS = ("kind", "types", "model", "state", "system", "leaves", "parts", "objects")
 ARRAYS = {"array": np.asarray, "scalar": lambda x: x[()], "jax": jnp.asarray}
@@ -86,7 +86,7 @@ class Archive:
     - `y`: a state, whose numbers do not matter. Without it a state is what the model's vector field returns, or made
         of dictionaries, tuples and NamedTuples.
 
-    **Raises:** `ValueError` for a file that is none of these, is damaged, is of a newer format, or of another model.
+    **Raises:** `ValueError` for a file that is none of these, is damaged, is of another format, or of another model.
     """
 
     system: System
@@ -119,15 +119,19 @@ class Archive:
             with open(self._path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
                 header = json.loads(file["json"].tobytes())
                 vectors = {name: file[name] for name in file.files if name != "json"}
-            newer = header["format"] > FORMAT
-            if not newer:
+            other = header["format"] - FORMAT
+            if not other:
                 _ = [header[key] for key in KEYS]
         except FileNotFoundError:
             raise
         except Exception as error:  # by what it fails depends on where the file was cut off
             raise ValueError(f"The file {self._path} is damaged, or nsjax did not write it.") from error
-        if newer:
-            raise ValueError(f"A newer version of nsjax wrote the file {self._path}, in format {header['format']}.")
+        if other:
+            age = "A newer" if other > 0 else "An older"
+            raise ValueError(
+                f"{age} version of nsjax wrote the file {self._path}, in format {header['format']}; this one reads "
+                f"format {FORMAT}. Make the branch anew, or read it with that version."
+            )
         return header, vectors
 
     def _decoded(self, code: Any, forms: dict[str, Any]) -> Any:

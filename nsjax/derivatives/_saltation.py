@@ -13,7 +13,7 @@ from .._numerics._autodiff import frozen
 from .._types import Scalar, Y
 from ..flow._solution import Events
 from ..flow.events._transition import completed, rebound
-from ..system._model import Model, State
+from ..system._model import ModeState, SwitchedSystem
 from ..system._system import arrays_of, clock, impact, relay, System
 
 
@@ -37,7 +37,7 @@ def _modes(system: System, mode: Any) -> tuple[Int[Array, ""], ...]:
     return tuple(jnp.asarray(m, jnp.int32) for m in mode)
 
 
-def states(model: Model, t: Scalar, y: Y, mode: tuple) -> State:
+def states(model: SwitchedSystem, t: Scalar, y: Y, mode: tuple) -> ModeState:
     """A mode with the component of h that is on its surface: the one nearest to zero."""
     parts = tuple(
         None
@@ -45,10 +45,10 @@ def states(model: Model, t: Scalar, y: Y, mode: tuple) -> State:
         else jnp.argmin(jnp.abs(jnp.stack(model.h(k, t, y)))).astype(jnp.int32)
         for k, switch in enumerate(model.switches)
     )
-    return State(mode, parts, tuple(jnp.zeros((), jnp.int32) for _ in mode))
+    return ModeState(mode, parts, tuple(jnp.zeros((), jnp.int32) for _ in mode))
 
 
-def fired(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+def fired(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
     """The guard of switch k that is at zero: its surface, or while sliding the bound that λ has reached."""
     switch = model.switches[k]
     mode = state.mode[k]
@@ -67,7 +67,7 @@ def fired(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
     return jnp.where(model.held(k, mode), left, surface)
 
 
-def landed(model: Model, k: int, t: Scalar, y: Y, state: State, after: tuple) -> tuple[Y, Scalar]:
+def landed(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState, after: tuple) -> tuple[Y, Scalar]:
     """The state after an event of switch k at `t`, `y`, and how long the impacts that lead to rest take together."""
     none = jnp.zeros_like(t)
     if not isinstance(model.switches[k], impact):
@@ -85,7 +85,7 @@ def landed(model: Model, k: int, t: Scalar, y: Y, state: State, after: tuple) ->
     return out, jnp.where(lands, rest, none)
 
 
-def _held(model: Model, t: Scalar, y: Y, mode: tuple) -> Y:
+def _held(model: SwitchedSystem, t: Scalar, y: Y, mode: tuple) -> Y:
     return model.project(t, y, states(model, t, y, mode))
 
 
@@ -104,7 +104,7 @@ class _Jump(NamedTuple):
     blur: tuple[Float[Array, " n"], Float[Array, " n"]]  # what rounding can make of f_before and f_after
 
 
-def _jump(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> _Jump:
+def _jump(model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> _Jump:
     flat, unravel = jfu.ravel_pytree(y)
 
     def ravel(y: Y) -> Array:
@@ -128,7 +128,7 @@ def _jump(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) ->
     f_after = ravel(model.flow(t, unravel(x), later))
     still, at, begin, end, drift = frozen((model, t, flat, x, jnp.abs(t * f_before)))
 
-    def blur(x: Array, state: State) -> Array:
+    def blur(x: Array, state: ModeState) -> Array:
         size = unravel(jnp.abs(x) + drift)  # the time, too, is known to rounding only
         return still.rounding(lambda t, y: ravel(still.flow(t, y, state)), at, unravel(x), size)
 
@@ -146,7 +146,7 @@ def _unless_rounding(x: Array, blur: Array) -> Array:
     return x - lax.stop_gradient(jnp.where(jnp.abs(x) < blur, x, 0))
 
 
-def _matrix(model: Model, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Float[Array, "n n"]:
+def _matrix(model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Float[Array, "n n"]:
     j = _jump(model, t, y, k, before, after)
     late = 1 + j.drest @ j.f_before + j.rest_t  # how much later the state of rest begins when the impact does
     blur = jnp.abs(j.dr) @ j.blur[0] + jnp.abs(late) * j.blur[1] + _part(j.r_t)
@@ -189,7 +189,7 @@ def saltation_matrix(
         raise ValueError(f"Argument `switch` must be one of {', '.join(names) or 'no switches'}, but got {switch!r}.")
     t, y = _float(t, y)
     system = arrays_of(system, t.dtype)
-    model = Model(system, jnp.ones_like(t), t, y)
+    model = SwitchedSystem(system, jnp.ones_like(t), t, y)
     before, after = _modes(system, mode_before), _modes(system, mode_after)
     return _matrix(model, t, y, names.index(switch), before, after)
 
@@ -199,7 +199,7 @@ def saltation_matrices(system: System, events: Events) -> Float[Array, "events n
     dtype = events.t.dtype
     system = arrays_of(system, dtype)
     template = jax.tree.map(lambda x: x[0], events.y_before)
-    model = Model(system, jnp.ones((), dtype), jnp.zeros((), dtype), template)
+    model = SwitchedSystem(system, jnp.ones((), dtype), jnp.zeros((), dtype), template)
 
     def one(t: Scalar, y: Y, switch: Array, before: Array, after: Array) -> Array:
         options = [_matrix(model, t, y, k, tuple(before), tuple(after)) for k in range(len(model.switches))]

@@ -15,7 +15,7 @@ from ..flow._arguments import check_solve
 from ..flow._results import raise_if, RESULTS
 from ..flow._solution import Solution
 from ..flow._solve import solve
-from ..system._model import Model, State
+from ..system._model import ModeState, SwitchedSystem
 from ..system._system import arrays_of, System
 from ._saltation import saltation_matrices, states
 
@@ -127,8 +127,8 @@ class _Arc(System):
     """y and Φ on an arc in a fixed mode: a smooth system, Φ' = (∂f/∂y) Φ. Its columns are perturbations, of the
     structure of the state, with one leading axis."""
 
-    model: Model
-    state: State
+    model: SwitchedSystem
+    state: ModeState
 
     def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
         y, columns = y
@@ -153,7 +153,7 @@ def _by_arcs(
     """Φ at the end of `sol`, with the jump of an event there, and at `times`, from the arcs between the events and the
     jumps at these."""
     flat, unravel = jfu.ravel_pytree(y0)
-    model = Model(system, jnp.ones_like(t0), t0, y0)
+    model = SwitchedSystem(system, jnp.ones_like(t0), t0, y0)
     n = flat.size
     eye = jnp.eye(n, dtype=flat.dtype)
     begin, end, state, modes = arcs(sol, t0, y0)

@@ -17,7 +17,7 @@ from .._types import Scalar, StateT, Y
 from ..derivatives._floquet import eigenvalues
 from ..flow._results import outcomes, RESULTS
 from ..orbits._orbit import ravel
-from ..system._model import Model, State
+from ..system._model import ModeState, SwitchedSystem
 from ..system._system import impact, relay, System
 
 
@@ -85,7 +85,7 @@ class Equilibrium(eqx.Module, Generic[StateT]):
         )
 
 
-def switch_values(model: Model, t: Scalar, state: State, sigma: Array) -> tuple[Any, ...]:
+def switch_values(model: SwitchedSystem, t: Scalar, state: ModeState, sigma: Array) -> tuple[Any, ...]:
     """The value of every switch, for those of the holdable ones."""
     s = list(model.signs(t, state))
     for i, k in enumerate(model.holdable):
@@ -97,7 +97,7 @@ def stacked_values(s: tuple[Any, ...], dtype: Any) -> Float[Array, " switches"]:
     return jnp.stack([jnp.asarray(v, dtype) for v in s]) if s else jnp.zeros(0, dtype)
 
 
-def balance(model: Model, t: Scalar, y: Y, sigma: Array, state: State) -> Float[Array, " equations"]:
+def balance(model: SwitchedSystem, t: Scalar, y: Y, sigma: Array, state: ModeState) -> Float[Array, " equations"]:
     """What vanishes at an equilibrium: the field; h on the surfaces that hold it, whose values are unknowns beside the
     state, (2.19)-(2.20); and what the values of the others differ from their signs."""
     rest = model.signs(t, state)
@@ -114,7 +114,7 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, ma
     """Newton's method on f(y, s) = 0 in a given mode, with the values of the surfaces that hold the state as unknowns
     beside it, and h = 0 there as their equations."""
     x0, unravel = jfu.ravel_pytree(lax.stop_gradient(y0))
-    model = Model(frozen(system), jnp.ones_like(t), t, y0)
+    model = SwitchedSystem(frozen(system), jnp.ones_like(t), t, y0)
     holdable = model.holdable
     state = nearest_state(model, t, y0, mode)
 
@@ -156,26 +156,26 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, ma
     )
 
 
-def _with(model: Model, system: System) -> Model:
+def _with(model: SwitchedSystem, system: System) -> SwitchedSystem:
     return eqx.tree_at(lambda m: m.system, model, system)
 
 
-def nearest_state(model: Model, t: Scalar, y: Y, mode: tuple) -> State:
+def nearest_state(model: SwitchedSystem, t: Scalar, y: Y, mode: tuple) -> ModeState:
     """The mode, with the component of h nearest to zero where h < 0 or on it, and its least one elsewhere."""
     parts = []
     for k, switch in enumerate(model.switches):
         one = model.parts[k] == 1 or isinstance(switch, relay)
         parts.append(None if one else jnp.argmin(jnp.stack(model.h(k, t, y))).astype(jnp.int32))
-    return State(mode, tuple(parts), tuple(jnp.zeros((), jnp.int32) for _ in mode))
+    return ModeState(mode, tuple(parts), tuple(jnp.zeros((), jnp.int32) for _ in mode))
 
 
-def _surface(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+def _surface(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
     h = jnp.stack(model.h(k, t, y))
     return h[0 if state.part[k] is None else state.part[k]]
 
 
 def linear_motion(
-    model: Model, t: Scalar, y: Y, state: State, s: tuple
+    model: SwitchedSystem, t: Scalar, y: Y, state: ModeState, s: tuple
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"], Int[Array, ""], Bool[Array, ""]]:
     """The Jacobian; the same with rates for the directions off the surfaces that hold the state which are far left of
     all others; how many these are; and whether the surfaces attract (2.24)."""
@@ -222,7 +222,9 @@ def _free(n: int, held: Int[Array, ""]) -> Bool[Array, " n"]:
     return jnp.arange(n, dtype=held.dtype) < n - held
 
 
-def _place(model: Model, t: Scalar, y: Y, state: State, s: tuple) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+def _place(
+    model: SwitchedSystem, t: Scalar, y: Y, state: ModeState, s: tuple
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Whether the state lies where its mode does, and whether on a surface that does not hold it."""
     admissible, boundary = jnp.ones((), bool), jnp.zeros((), bool)
     for k, switch in enumerate(model.switches):

@@ -15,7 +15,7 @@ from .._types import StateT, Y
 from ..flow._arguments import check_solve
 from ..flow._results import raise_if, RESULTS
 from ..orbits._orbit import ravel
-from ..system._model import Model
+from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, clock, impact, sgn, System
 from ._equilibrium import Equilibrium, equilibrium_in
 
@@ -56,7 +56,7 @@ def find_equilibrium(
     **Raises:** `ValueError` for a model that time enters; a runtime error if Newton's method does not converge.
     """
     system, y0, t, given, tol = checked_equilibrium(system, y0, t, mode, tol)
-    model = Model(system, jnp.ones_like(t), t, y0)
+    model = SwitchedSystem(system, jnp.ones_like(t), t, y0)
     names = [k.name for k in system.switches]
     chosen = tuple(given.get(n, m) for n, m in zip(names, _mode_of(model, t, y0)))
     found = equilibrium_in(system, t, y0, chosen, tol, max_iterations)
@@ -98,7 +98,7 @@ def find_equilibria(
     first = jax.tree.map(lambda x: jnp.asarray(x)[0], starts)
     system, first, t, given, tol = checked_equilibrium(system, first, t, mode, tol)
     starts = jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), starts, first)
-    model = Model(system, jnp.ones_like(t), t, first)
+    model = SwitchedSystem(system, jnp.ones_like(t), t, first)
     found = _in_all_modes(system, model, t, starts, given, tol, max_iterations)
     distinct: list[Equilibrium] = []
     for one in sorted(found, key=lambda one: (not one.admissible, bool(one.boundary))):
@@ -122,7 +122,7 @@ def checked_equilibrium(system: System, y0: Y, t: Any, mode: Any, tol: float | N
     return system, y0, t, given, (1e-12 if jnp.finfo(t.dtype).eps < 1e-10 else 1e-5) if tol is None else tol
 
 
-def _options(model: Model, given: dict[str, Any]) -> list[tuple[int, ...]]:
+def _options(model: SwitchedSystem, given: dict[str, Any]) -> list[tuple[int, ...]]:
     """The modes that each switch may have."""
     options = []
     for k, switch in enumerate(model.switches):
@@ -135,7 +135,7 @@ def _options(model: Model, given: dict[str, Any]) -> list[tuple[int, ...]]:
     return options
 
 
-def _mode_of(model: Model, t: Any, y: Y) -> list[Any]:
+def _mode_of(model: SwitchedSystem, t: Any, y: Y) -> list[Any]:
     """By the signs of h; what lies on a surface that can hold it counts as held."""
     modes = []
     for k, switch in enumerate(model.switches):
@@ -150,7 +150,7 @@ def _mode_of(model: Model, t: Any, y: Y) -> list[Any]:
 
 
 def _in_all_modes(
-    system: System, model: Model, t: Any, starts: Y, given: dict[str, Any], tol: float, max_iterations: int
+    system: System, model: SwitchedSystem, t: Any, starts: Y, given: dict[str, Any], tol: float, max_iterations: int
 ) -> list[Equilibrium]:
     """What Newton's method finds from every start in every mode."""
     table = list(itertools.product(*_options(model, given)))

@@ -13,7 +13,7 @@ import numpy as np
 from .._numerics._text import components, written
 from .._types import Y
 from ..system._checks import closing_contacts
-from ..system._model import Model, State
+from ..system._model import ModeState, SwitchedSystem
 from ..system._system import clock, impact, relay
 from ._results import RESULTS
 from ._solution import Solution
@@ -35,7 +35,7 @@ def explain(system: Any, sol: Solution) -> str:
         )
         text = f"The steps became too small at {where}: {cause}."
     elif result == RESULTS.wrong_contact:
-        model = Model(system, jnp.ones_like(sol.t1), sol.t1, sol.y1)
+        model = SwitchedSystem(system, jnp.ones_like(sol.t1), sol.t1, sol.y1)
         closes = closing_contacts(model.at(sol.t1), sol.t1, sol.y1)
         name = next((model.switches[k].name for k, bad in closes.items() if bad), "name")
         text = (
@@ -52,10 +52,10 @@ def explain(system: Any, sol: Solution) -> str:
 def _pieces(system: Any, t: Any, y: Y, mode: Any) -> list[tuple[str, list[tuple[str, Any]]]]:
     """What the model's methods return, named."""
     owner, out = type(system).__name__, []
-    model = Model(system, jnp.ones_like(t), t, y)
+    model = SwitchedSystem(system, jnp.ones_like(t), t, y)
     zero = jnp.zeros((), jnp.int32)
     parts = tuple(zero if n > 1 else None for n in model.parts)
-    state = State(tuple(mode), parts, tuple(zero for _ in model.switches))
+    state = ModeState(tuple(mode), parts, tuple(zero for _ in model.switches))
     model = model.within(state.mode)
     for k, switch in enumerate(model.switches):
         if isinstance(switch, clock):

@@ -18,7 +18,7 @@ from .._numerics._autodiff import frozen
 from .._numerics._barrier import once
 from .._numerics._lane_cond import compact_cond
 from .._types import Scalar, Y
-from ..system._model import BEYOND, Model, State
+from ..system._model import BEYOND, ModeState, SwitchedSystem
 from ..system._system import impact
 from ._results import RESULTS
 from ._save import Log, Saved
@@ -33,7 +33,7 @@ class Carry(eqx.Module):
     t: Scalar
     y: Y
     f: Y  # the field at (t, y)
-    state: State
+    state: ModeState
     dt: Scalar
     controller: PyTree
     active: Bool[Array, ""]
@@ -68,7 +68,7 @@ class _Attempt(NamedTuple):
 class Flow(eqx.Module):
     """One solve: the model, the method, and the body of its loop."""
 
-    model: Model
+    model: SwitchedSystem
     stepper: Stepper
     controller: dfx.AbstractStepSizeController
     t0: Scalar
@@ -88,7 +88,7 @@ class Flow(eqx.Module):
         return getattr(self.controller, "rtol", jnp.nan), getattr(self.controller, "atol", jnp.nan)
 
     def land(
-        self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: State, coefficients: list, noise: list, touches: list
+        self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: ModeState, coefficients: list, noise: list, touches: list
     ) -> Landing:
         """The step once more, to its first event."""
         model = self.model.within(state.mode)
@@ -187,7 +187,7 @@ class Flow(eqx.Module):
         )
         return keep, b - a, controller, outcome
 
-    def leaps(self, model: Model, c: Carry, step: Step) -> Bool[Array, ""]:
+    def leaps(self, model: SwitchedSystem, c: Carry, step: Step) -> Bool[Array, ""]:
         """Whether a guard that no step is short enough to resolve jumps: changes by far more than its derivatives at
         both ends of the step make it, and rounding. (One with a kink does not.)"""
         change = jax.tree.map(lambda a, b, f: jnp.abs(b - a) + jnp.abs(f * (step.t_next - c.t)), c.y, step.y1, c.f)

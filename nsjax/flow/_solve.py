@@ -18,7 +18,7 @@ from .._numerics._jaxpr import is_affine, may_jump
 from .._numerics._text import known, suggesting
 from .._types import Scalar, StateT, Y
 from ..system._checks import check_model, closing_contacts, laws
-from ..system._model import Model, State
+from ..system._model import ModeState, SwitchedSystem
 from ..system._system import arrays_of, System
 from ._arguments import check_numbers, check_solve
 from ._diagnosis import explain
@@ -70,7 +70,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     direction = jnp.where(t1 >= t0, 1, -1).astype(t0.dtype)
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
-    model = Model(system, direction, start, y0).at(start)
+    model = SwitchedSystem(system, direction, start, y0).at(start)
     max_events = max_events if model.slots else 0
     state, forked, result = start_mode(model, start, y0, given, frozen(stop - start))
     stepper = _stepper(solver).made_for(model, state, start, y0)
@@ -227,7 +227,7 @@ def _row(mode: tuple) -> Int[Array, " switches"]:
     return jnp.stack(mode) if mode else jnp.zeros(0, jnp.int32)
 
 
-def _events(model: Model, c: Carry, start: State) -> Events:
+def _events(model: SwitchedSystem, c: Carry, start: ModeState) -> Events:
     log = c.log or Log(0, c.y, len(model.switches))
     table = jnp.asarray([s.switch for s in model.slots] + [-1], jnp.int32)
     first = _row(start.mode)[None] if model.switches else jnp.zeros((1, 0), jnp.int32)

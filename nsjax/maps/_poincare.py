@@ -25,7 +25,7 @@ from ..flow._results import is_okay, outcomes, raise_if, RESULTS
 from ..flow._solve import solve
 from ..flow.events._initial_mode import AT_ONCE, start_mode
 from ..system._checks import check_model, check_system
-from ..system._model import Model, State
+from ..system._model import ModeState, SwitchedSystem
 from ..system._system import AbstractSwitch, arrays_of, clock, forwarded, impact, relay, sgn, SwitchValues, System
 
 
@@ -147,7 +147,7 @@ class PoincareMap(eqx.Module):
         t = check_model(system, t, y, one)
         system = self.flow_of(system)
         still, t_still, y_still = frozen((system, t, y))
-        model = Model(still, one, t_still, y_still)
+        model = SwitchedSystem(still, one, t_still, y_still)
         # An impact that cannot be rested upon has one mode only, of which `solve` wants to hear nothing.
         named = tuple(k in model.contacts or not isinstance(s, impact) for k, s in enumerate(model.switches))
         given = {s.name: given[s.name] for s, may in zip(model.switches, named) if may and s.name in given}
@@ -155,7 +155,7 @@ class PoincareMap(eqx.Module):
         modes = [m.astype(jnp.int32) for m in self.sides(model, t_still, y_still, state)]
         return Start(t, t, y, jnp.stack(modes) if modes else jnp.zeros(0, jnp.int32), result, named)
 
-    def sides(self, model: Model, t: Scalar, y: Y, state: State) -> tuple[Array, ...]:
+    def sides(self, model: SwitchedSystem, t: Scalar, y: Y, state: ModeState) -> tuple[Array, ...]:
         """The mode in which a solution sets out."""
         return state.mode
 
@@ -203,7 +203,7 @@ class _Section(PoincareMap):
     def horizon(self, system: System, t: Scalar) -> Scalar:
         return self.max_time
 
-    def sides(self, model: Model, t: Scalar, y: Y, state: State) -> tuple[Array, ...]:
+    def sides(self, model: SwitchedSystem, t: Scalar, y: Y, state: ModeState) -> tuple[Array, ...]:
         """A start on the section is no return. Nor is one that an earlier computation left a little before it: it
         counts as being beyond."""
         if self.section is None:

@@ -16,7 +16,7 @@ from ..derivatives._saltation import states
 from ..derivatives._variational import arcs
 from ..flow._results import is_okay, RESULTS
 from ..flow._solve import solve
-from ..system._model import Model
+from ..system._model import SwitchedSystem
 from ..system._system import clock, relay, sgn, System
 from ._orbit import distance, ravel
 
@@ -67,7 +67,7 @@ def undecided(system: System, t0: Scalar, y0: Y) -> dict[str, Bool[Array, ""]]:
     return {k.name: (k.guard(system, t0, y0) <= 0) & (k.off_guard(system, t0, y0) <= 0) for k in relays}
 
 
-def at_start(model: Model, t: Scalar, y: Y, given: Relays = None) -> Any:
+def at_start(model: SwitchedSystem, t: Scalar, y: Y, given: Relays = None) -> Any:
     """The mode by the signs of h, and of relays within their hysteresis that which is given; a surface counts as slid
     upon."""
     modes = []
@@ -131,7 +131,7 @@ def settle_down(
 def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
     """Whether an equilibrium of the sliding field is one of a continuum: on the surfaces that hold it the derivative of
     the field is singular."""
-    model = Model(system, jnp.ones_like(t0), t0, y)
+    model = SwitchedSystem(system, jnp.ones_like(t0), t0, y)
     state = at_start(model, t0, y)
     x, unravel = jfu.ravel_pytree(y)
     matrix = jax.jacfwd(lambda x: ravel(model.flow(t0, unravel(x), state)))(x)

@@ -19,7 +19,7 @@ from ..derivatives._variational import arcs, monodromy_by_arcs
 from ..flow._results import is_okay, RESULTS
 from ..flow._solution import Events
 from ..flow._solve import solve
-from ..system._model import Model
+from ..system._model import SwitchedSystem
 from ..system._system import relay, System
 from ._guess import at_start, base_point
 from ._orbit import distance, fractions, judge, Orbit, ravel
@@ -48,7 +48,7 @@ def shoot(
     autonomous = system.period is None
     still = frozen(system)
     guess = lax.stop_gradient(y0)
-    model = Model(still, jnp.ones_like(frozen(t0)), frozen(t0), guess)
+    model = SwitchedSystem(still, jnp.ones_like(frozen(t0)), frozen(t0), guess)
     if autonomous:
         guess, period, mode = lax.stop_gradient(
             base_point(still, frozen(t0), guess, lax.stop_gradient(period), sign, mode, how)

@@ -20,7 +20,7 @@ from .._numerics._jaxpr import is_constant
 from .._numerics._series import Series
 from .._types import Scalar, Y
 from ..system._checks import check_model, check_system
-from ..system._model import Model, State
+from ..system._model import ModeState, SwitchedSystem
 from ..system._system import AbstractSwitch, arrays_of, forwarded, sgn, SwitchValues, System
 
 
@@ -213,11 +213,11 @@ class Banded(_Regularised):
         one = jnp.ones_like(t)
         check_model(self.system, t, y, one)
         pulled = _Pulled(self.system, s, self.rate, t)
-        model = Model(pulled, one, t, y)
+        model = SwitchedSystem(pulled, one, t, y)
         return pulled.values(model.values(t, y, _banded_mode(model, self.eta, t, y)))
 
 
-def _banded_mode(model: Model, eta: Any, t: Scalar, y: Y) -> State:
+def _banded_mode(model: SwitchedSystem, eta: Any, t: Scalar, y: Y) -> ModeState:
     """A mode from the state alone: held are the surfaces in whose band it is, if they attract and |λ| <= b."""
     model, eta, t, y = frozen((model, eta, t, y))  # modes have no derivative
     heights = [jnp.stack(model.h(k, t, y)) for k in range(len(model.switches))]
@@ -225,8 +225,8 @@ def _banded_mode(model: Model, eta: Any, t: Scalar, y: Y) -> State:
     side = jnp.stack([jnp.where(jnp.min(h) >= 0, 1, -1) for h in heights]).astype(jnp.int32)
     which = model.holdable
 
-    def state(mode: Int[Array, " switches"]) -> State:
-        return State(tuple(mode), part, tuple(jnp.zeros_like(m) for m in mode))
+    def state(mode: Int[Array, " switches"]) -> ModeState:
+        return ModeState(tuple(mode), part, tuple(jnp.zeros_like(m) for m in mode))
 
     if not which:
         return state(side)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool
 
 from .._numerics._jaxpr import is_affine, is_constant
 from .._types import Scalar, Y
-from ._model import Model, State
+from ._model import ModeState, SwitchedSystem
 from ._system import AbstractSwitch, clock, impact, relay, sgn, System
 
 
@@ -258,10 +258,10 @@ def check_clocks(system: System) -> None:
             )
 
 
-def closing_contacts(model: Model, t: Scalar, y: Y) -> dict[int, Bool[Array, ""]]:
+def closing_contacts(model: SwitchedSystem, t: Scalar, y: Y) -> dict[int, Bool[Array, ""]]:
     """Of each contact force whether it closes its gap, which it must not."""
     zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
-    free = State((), (None,) * len(zeros), ())
+    free = ModeState((), (None,) * len(zeros), ())
     found = {}
     for k in model.contacts:
         unit = tuple(jnp.where(i == k, 1, zero) for i, zero in enumerate(zeros))

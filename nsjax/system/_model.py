@@ -36,10 +36,10 @@ class Slot(NamedTuple):
     holding: bool  # whether it watches λ
 
 
-class State(NamedTuple):
+class ModeState(NamedTuple):
     """A mode, with the component of h that is active on the surface of each switch (None for a smooth surface) and
     the number of roots at the present instant, to be left out when the next one is sought; of a switch that is held the
-    sign of the bound that its value is at, or 0, and see `Model.edge`."""
+    sign of the bound that its value is at, or 0, and see `SwitchedSystem.edge`."""
 
     mode: Mode
     part: tuple[Int[Array, ""] | None, ...]
@@ -52,7 +52,7 @@ def _pick(values: tuple[Any, ...], index: Any) -> Any:
     return jnp.stack(values)[index]
 
 
-class Model(eqx.Module):
+class SwitchedSystem(eqx.Module):
     """A system as the flow sees it: time multiplied by `direction` so that it always increases, and the structure of
     its switches worked out once while tracing."""
 
@@ -131,7 +131,7 @@ class Model(eqx.Module):
 
     # Time, which is kept between the ticks of the clocks: at a tick functions of it are taken from the mode's side.
 
-    def within(self, mode: Mode) -> "Model":
+    def within(self, mode: Mode) -> "SwitchedSystem":
         """The same for a mode, that tells between which ticks it is."""
         if not self.clocks:
             return self
@@ -141,12 +141,12 @@ class Model(eqx.Module):
             lambda m: m.window, self, frozen((low, high)), is_leaf=lambda x: x is None or x is self.window
         )
 
-    def at(self, t: Scalar) -> "Model":
+    def at(self, t: Scalar) -> "SwitchedSystem":
         """The same for what sets out at time `t`."""
         zero, counts = jnp.zeros((), jnp.int32), self.counts(t)
         return self.within(tuple(counts.get(k, zero) for k in range(len(self.switches))))
 
-    def _in(self, state: State) -> "Model":
+    def _in(self, state: ModeState) -> "SwitchedSystem":
         return self if self.window is not None else self.within(state.mode)
 
     def span(self, k: int, mode: Mode) -> tuple[Scalar, Scalar]:
@@ -243,7 +243,7 @@ class Model(eqx.Module):
         """Whether one of its switches does; of a mode that is known."""
         return any(bool(self.held(k, mode[k])) for k in self.holdable)
 
-    def level(self, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+    def level(self, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
         """What its multiplier keeps at zero: the active component of h; for a contact dh/dt, as forces act on that."""
         self = self._in(state)
 
@@ -255,7 +255,7 @@ class Model(eqx.Module):
         zeros = tuple(jnp.zeros((), t.dtype) for _ in self.switches)
         return jax.jvp(h, (t, y), (jnp.ones_like(t), self.field(t, y, zeros)))[1]
 
-    def rates(self, which: tuple[int, ...], t: Scalar, y: Y, state: State, s: tuple) -> tuple[Scalar, ...]:
+    def rates(self, which: tuple[int, ...], t: Scalar, y: Y, state: ModeState, s: tuple) -> tuple[Scalar, ...]:
         """The rates of change of `level` for each switch in `which`, for switch values `s`."""
         self = self._in(state)
 
@@ -264,20 +264,20 @@ class Model(eqx.Module):
 
         return jax.jvp(levels, (t, y), (jnp.ones_like(t), self.field(t, y, s)))[1]
 
-    def approach(self, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+    def approach(self, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
         """dh/dt of switch k along the flow (the active component of h)."""
         self = self._in(state)
         f = self.flow(t, y, state)
         return jax.jvp(lambda t, y: _pick(self.h(k, t, y), state.part[k]), (t, y), (jnp.ones_like(t), f))[1]
 
-    def signs(self, t: Scalar, state: State) -> tuple[Any, ...]:
+    def signs(self, t: Scalar, state: ModeState) -> tuple[Any, ...]:
         """Switch values of a mode, with 0 for those which are held, and for contacts."""
         return tuple(
             jnp.zeros((), t.dtype) if isinstance(switch, impact) else m.astype(t.dtype)
             for switch, m in zip(self.switches, state.mode)
         )
 
-    def linear(self, t: Scalar, y: Y, state: State, s: tuple) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
+    def linear(self, t: Scalar, y: Y, state: ModeState, s: tuple) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
         """Rates of the holdable surfaces at `s`, and their derivatives with respect to the holdable values."""
         self = self._in(state)
         which = self.holdable
@@ -322,7 +322,7 @@ class Model(eqx.Module):
             matrix, right = jnp.where(instead[:, None], share, matrix), jnp.where(instead, 0, right)
         return linear_solve(matrix, right)
 
-    def values(self, t: Scalar, y: Y, state: State) -> tuple[Any, ...]:
+    def values(self, t: Scalar, y: Y, state: ModeState) -> tuple[Any, ...]:
         """The value of every switch in a mode: signs, and the multipliers λ of those that are held, (2.20)."""
         self = self._in(state)
         s = self.signs(t, state)
@@ -361,12 +361,12 @@ class Model(eqx.Module):
         force = jnp.asarray([k in self.contacts for k in which])
         return put(lax.fori_loop(0, 6, newton, jnp.where(held & force, 1, sigma)))
 
-    def flow(self, t: Scalar, y: Y, state: State) -> Y:
+    def flow(self, t: Scalar, y: Y, state: ModeState) -> Y:
         """The right-hand side in a mode; for a sliding one it is Filippov's field (2.19)."""
         self = self._in(state)
         return self.field(t, y, self.values(t, y, state))
 
-    def force(self, t: Scalar, y: Y, state: State) -> Scalar:
+    def force(self, t: Scalar, y: Y, state: ModeState) -> Scalar:
         """The largest component of the terms that make up the field: with it those which cancel where it is held."""
         self = frozen(self._in(state))
         t, y = frozen((t, y))
@@ -378,7 +378,7 @@ class Model(eqx.Module):
             size = jax.tree.map(lambda a, b: a + jnp.abs(b), size, pull)
         return ft.reduce(jnp.maximum, [jnp.max(x) for x in jax.tree.leaves(size)])
 
-    def project(self, t: Scalar, y: Y, state: State) -> Y:
+    def project(self, t: Scalar, y: Y, state: ModeState) -> Y:
         """Removes the drift off the surfaces that hold the solution.
 
         The state moves along ∂f/∂s, the direction in which the switch acts, so that the result does not depend on the
@@ -415,7 +415,12 @@ class Model(eqx.Module):
         return max(self.parts, default=1)
 
     def guards(
-        self, t: Scalar, y: Y, state: State, wanted: tuple[bool, ...] | None = None, s: tuple[Any, ...] | None = None
+        self,
+        t: Scalar,
+        y: Y,
+        state: ModeState,
+        wanted: tuple[bool, ...] | None = None,
+        s: tuple[Any, ...] | None = None,
     ) -> list[list[Scalar]]:
         """`guards[slot][part]` (of the slots that are `wanted`, else empty), as scalars: stacked arrays of two or
         five cost XLA's CPU code several times as much. `s`: the values of the switches, if they are known."""
@@ -459,7 +464,7 @@ class Model(eqx.Module):
         like = jnp.full_like(rows[0][0], filler)
         return jnp.stack([jnp.stack(row + [like] * (self.width - len(row))) for row in rows])
 
-    def _corner_guard(self, slot: Slot, t: Scalar, y: Y, state: State) -> list[Scalar]:
+    def _corner_guard(self, slot: Slot, t: Scalar, y: Y, state: ModeState) -> list[Scalar]:
         """h = min(h_1, ..., h_J). Where h > 0 each component is watched alone; where h < 0 the event is the instant at
         which the last of them becomes positive; while sliding on one, the others end the surface at its tip."""
         k, j = slot.switch, slot.part
@@ -470,7 +475,7 @@ class Model(eqx.Module):
             return [jnp.where(mode < 0, -h[0], alone)] + [jnp.where(mode < 0, -hi, -one) for hi in h[1:]]
         return [jnp.where(mode < 0, one, alone)]
 
-    def known_roots(self, state: State) -> list[list[Int[Array, ""]]]:
+    def known_roots(self, state: ModeState) -> list[list[Int[Array, ""]]]:
         """How many roots each guard has at the present instant (just left, so not to be found again)."""
         rows = []
         none = jnp.zeros((), jnp.int32)

@@ -178,12 +178,12 @@ def test_without_numbers(name):
 
 
 def test_all_public_results_are_in_the_table():
-    """`Solution` is in `test_mistakes`, `OrbitGrowth` in `test_orbit_growth`."""
+    """`Solution` is in `test_mistakes`, `OrbitContinuation` in `test_orbit_growth`."""
     others = {
         "Method",
         "Segment",
         "Solution",
-        "OrbitGrowth",
+        "OrbitContinuation",
         "System",
         "Exponential",
         "Taylor",

@@ -174,7 +174,7 @@ def test_growing():
     """A branch can be looked at while it grows, left, and gone on with."""
     system = gallery.StickSlip(c=0.1, v_dr=0.5)
     orbit = orbit_of(system, Motion(2.0, 0.0), period=8.0)
-    growth = nsjax.OrbitGrowth(system, orbit, "v_dr", (0.45, 0.6))
+    growth = nsjax.OrbitContinuation(system, orbit, "v_dr", (0.45, 0.6))
     for point in growth:
         if point.parameter > 0.52:
             break

@@ -15,7 +15,7 @@ import pytest
 from models import Motion, pid
 
 import nsjax
-from nsjax import find_orbit, gallery, OrbitBranch, OrbitGrowth
+from nsjax import find_orbit, gallery, OrbitBranch, OrbitContinuation
 from nsjax.continuation._progress import ProgressLine
 
 
@@ -65,7 +65,7 @@ MEASURES = {
 
 def grown(system, orbit, parameter, interval, **options):
     """A continuation that is done, and how many points it gave."""
-    growth = OrbitGrowth(system, orbit, parameter, interval, **options)
+    growth = OrbitContinuation(system, orbit, parameter, interval, **options)
     return growth, sum(1 for _ in growth)
 
 
@@ -107,12 +107,12 @@ def same(found, want):
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.55, 0.8, 1.0])
 def test_gone_on_with(belt, tmp_path, share):
     what, options, whole, count = belt
-    growth = OrbitGrowth(*what, **options)
+    growth = OrbitContinuation(*what, **options)
     for _ in range(int(share * count)):
         next(growth)
     growth.save(tmp_path / "growth")
     part = growth.branch
-    loaded = OrbitGrowth.load(tmp_path / "growth", gallery.StickSlip(), **options)
+    loaded = OrbitContinuation.load(tmp_path / "growth", gallery.StickSlip(), **options)
     same(loaded.branch, part)
     assert sum(1 for _ in loaded) == count - int(share * count)
     same(loaded.branch, whole.branch)
@@ -123,12 +123,12 @@ def test_several_branches(duffing, tmp_path):
     """Saved and loaded again and again: nodes, and what meets there, are still one."""
     what, options, whole, count = duffing
     assert len(whole.branch.branches) == 2 and whole.branch.bifurcations
-    growth = OrbitGrowth(*what, **options)
+    growth = OrbitContinuation(*what, **options)
     for i in range(count):
         next(growth)
         if i % 7 == 0:
             growth.save(tmp_path / "growth")
-            growth = OrbitGrowth.load(tmp_path / "growth", Duffing(omega=3.0), record=options["record"])
+            growth = OrbitContinuation.load(tmp_path / "growth", Duffing(omega=3.0), record=options["record"])
     with pytest.raises(StopIteration):
         next(growth)
     same(growth.branch, whole.branch)
@@ -138,7 +138,7 @@ def test_several_branches(duffing, tmp_path):
 def test_interrupted(belt, tmp_path, monkeypatch):
     """By the user: between two points, or in the middle of the work on one."""
     what, options, whole, count = belt
-    growth = OrbitGrowth(*what, **options)
+    growth = OrbitContinuation(*what, **options)
     with pytest.raises(KeyboardInterrupt):
         for i, _ in enumerate(growth):
             if i == 5:
@@ -159,7 +159,7 @@ def test_interrupted(belt, tmp_path, monkeypatch):
             for _ in growth:
                 pass
         growth.save(tmp_path / "growth")
-        growth = OrbitGrowth.load(tmp_path / "growth", what[0], **options)
+        growth = OrbitContinuation.load(tmp_path / "growth", what[0], **options)
     monkeypatch.undo()
     assert sum(1 for _ in growth) > 0
     same(growth.branch, whole.branch)
@@ -198,7 +198,7 @@ def test_mistakes(belt, duffing, tmp_path):
     path = tmp_path / "growth"
     duffing[2].save(path)
     whole = path.read_bytes()
-    load, model = partial(OrbitGrowth.load, record=MEASURES), Duffing()
+    load, model = partial(OrbitContinuation.load, record=MEASURES), Duffing()
     for size in (0, 10, len(whole) // 2, len(whole) - 30):
         path.write_bytes(whole[:size])
         with pytest.raises(ValueError, match="damaged, or nsjax did not write it"):
@@ -220,7 +220,8 @@ def test_mistakes(belt, duffing, tmp_path):
             np.savez(file, json=np.frombuffer(json.dumps(header | changes).encode(), np.uint8), **parts)
 
     for changes, message in (
-        (dict(format=2), "A newer version of nsjax"),
+        (dict(format=3), "A newer version of nsjax"),
+        (dict(format=1), "An older version of nsjax.*Make the branch anew"),
         (dict(kind="OrbitBranch"), "holds an `OrbitBranch`"),
         (dict(types={}), "Another version of nsjax"),
         (dict(objects=[]), "is damaged"),
@@ -281,12 +282,12 @@ def test_records_are_drawn(duffing):
 )
 def test_mistaken_records(duffing, record, message):
     with pytest.raises(ValueError, match=message):
-        OrbitGrowth(*duffing[0], record=record)
+        OrbitContinuation(*duffing[0], record=record)
 
 
 def test_records_of_changing_shape(duffing):
     counter = iter(range(1, 100))
-    growth = OrbitGrowth(*duffing[0], record={"more": lambda ts, ys: np.zeros(next(counter))})
+    growth = OrbitContinuation(*duffing[0], record={"more": lambda ts, ys: np.zeros(next(counter))})
     with pytest.raises(ValueError, match="`record\\['more'\\]` must return arrays of one shape, but gave \\(2,\\)"):
         next(growth)
 

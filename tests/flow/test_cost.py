@@ -9,7 +9,7 @@ from programs import count
 
 import nsjax
 from nsjax import solve
-from nsjax.system._model import Model
+from nsjax.system._model import SwitchedSystem
 
 
 class Free(nsjax.System):
@@ -121,7 +121,7 @@ def test_no_multiplier_where_nothing_slides():
     t, y = jnp.zeros(()), Motion(jnp.ones(()), jnp.ones(()))
 
     def slots(system):
-        return [(s.switch, s.holding) for s in Model(system, jnp.ones(()), t, y).slots]
+        return [(s.switch, s.holding) for s in SwitchedSystem(system, jnp.ones(()), t, y).slots]
 
     assert slots(Free()) == []
     assert slots(Crossing()) == [(0, False)] == slots(Idle())

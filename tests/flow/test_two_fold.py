@@ -14,7 +14,7 @@ from models import flat, Motion, pid
 
 import nsjax
 from nsjax import RESULTS, solve
-from nsjax.system._model import Model
+from nsjax.system._model import SwitchedSystem
 
 
 class Plane(NamedTuple):
@@ -182,7 +182,7 @@ def test_cost():
     """Only models in which what acts on a surface is not constant look for it."""
 
     def steady(system, y0):
-        return Model(system, jnp.ones(()), jnp.zeros(()), jax.tree.map(jnp.asarray, y0)).steady
+        return SwitchedSystem(system, jnp.ones(()), jnp.zeros(()), jax.tree.map(jnp.asarray, y0)).steady
 
     assert not any(steady(system, y0) for system, y0, *_ in FOLDS.values())
     assert steady(Turning(), Plane(0.0, 0.0)) and not steady(Beside(), Space(0.0, 0.0, 0.0))

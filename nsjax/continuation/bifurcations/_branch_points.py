@@ -18,8 +18,8 @@ from jaxtyping import Array
 from ...orbits.segments._equations import OrbitCurve, row_sizes
 from ...orbits.segments._itinerary import Course
 from ..orbits._test_functions import Test
-from ..orbits._tracer import of_circle, of_corners, Spot
-from ._surface import AbstractLocus, DELTA, interval_tests, Place, seen_at
+from ..orbits._tracer import of_circle, of_corners, OrbitPoint
+from ._surface import AbstractBifurcationTracer, DELTA, interval_tests, Place, seen_at
 
 
 ISOLATED = 1e-2  # curvature of β along the curve, over that across it: zero where there is a curve
@@ -101,10 +101,10 @@ class _Frame:
 
 
 @dataclasses.dataclass
-class BranchLocus(AbstractLocus):
+class BranchLocus(AbstractBifurcationTracer):
     """The curve of the branch points, followed on no surface of regular points."""
 
-    def place(self, spot: Spot, along: np.ndarray | None = None, heading: np.ndarray | None = None) -> Place:
+    def place(self, spot: OrbitPoint, along: np.ndarray | None = None, heading: np.ndarray | None = None) -> Place:
         frame = _Frame.at(self.curve, spot.course, spot.look.u)
         if along is None:  # where the branch was is known by interpolation
             u = frame.critical()
@@ -120,12 +120,12 @@ class BranchLocus(AbstractLocus):
         slope = float(abs(values[others]).min())
         return Place(spot, tangent, vectors[:, others[0]] @ frame.plane, slope, tangent[-2:])
 
-    def step(self, place: Place, length: float) -> Spot:
+    def step(self, place: Place, length: float) -> OrbitPoint:
         frame = _Frame.at(self.curve, place.spot.course, place.spot.look.u)
         ahead = frame.plane @ place.along
         return self._seen(place.spot.course, frame.critical(ahead / np.linalg.norm(ahead), length), frame)
 
-    def _seen(self, course: Course, u: np.ndarray, frame: _Frame) -> Spot:
+    def _seen(self, course: Course, u: np.ndarray, frame: _Frame) -> OrbitPoint:
         spot = seen_at(self.curve, course, u, frame.plane[:2])
         # At a point where the equations are singular there is no tangent plane.
         return dataclasses.replace(spot, look=spot.look._replace(tangent=frame.plane[:2]))

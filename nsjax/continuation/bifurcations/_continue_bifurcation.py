@@ -16,11 +16,11 @@ from ..equilibria._branch import CLOSED
 from ..orbits._bifurcation import OrbitBifurcation
 from ..orbits._record import states_of
 from ..orbits._test_functions import CORNERS, Test
-from ..orbits._tracer import midpoint, Spot
+from ..orbits._tracer import midpoint, OrbitPoint
 from ..orbits.corners._corner import is_impact
 from ._branch_points import BranchLocus
-from ._surface import CUSP, lifted, Locus, RESONANCES, surfaces_of, touches
-from ._tracer import FAILED, LAST, Met, trace, Trail
+from ._surface import BifurcationTracer, CUSP, lifted, RESONANCES, surfaces_of, touches
+from ._tracer import Codim2Point, FAILED, LAST, trace, Trail
 
 
 @shown
@@ -177,7 +177,7 @@ def continue_bifurcation(
             )
     low, high = (np.array([first[i], interval[i]], float) for i in (0, 1))
     surface, spot, test = lifted(origin, path, low, high)
-    kind_of_locus = BranchLocus if test.kind == "branch" else Locus
+    kind_of_locus = BranchLocus if test.kind == "branch" else BifurcationTracer
     locus = kind_of_locus(surface, test, float(spot.look.branch[1]))
     try:
         place = locus.place(spot)
@@ -202,11 +202,11 @@ def continue_bifurcation(
     unravel = jfu.ravel_pytree(surface.like)[1]
     silent = {test.kind for test in locus.silent}
 
-    def multipliers(spot: Spot) -> np.ndarray:
+    def multipliers(spot: OrbitPoint) -> np.ndarray:
         rho = np.asarray(spot.multipliers, complex)
         return np.full_like(rho, np.nan) if "flip" in silent else rho
 
-    def codimension_two(i: int, m: Met) -> CodimensionTwo:
+    def codimension_two(i: int, m: Codim2Point) -> CodimensionTwo:
         t, x, _ = bases[i]
         return CodimensionTwo(
             name=_name(surface, kind, m),
@@ -233,13 +233,13 @@ def continue_bifurcation(
     )
 
 
-def _kind(curve: OrbitCurve, spot: Spot, special: OrbitBifurcation, test: Test) -> tuple[str, tuple[str, ...]]:
+def _kind(curve: OrbitCurve, spot: OrbitPoint, special: OrbitBifurcation, test: Test) -> tuple[str, tuple[str, ...]]:
     if test.kind not in (*CORNERS, "grazing"):
         return special.kind, ()
     return _touching(curve, spot, test), special.surfaces or surfaces_of(curve, spot, test)
 
 
-def _touching(curve: OrbitCurve, spot: Spot, test: Test) -> str:
+def _touching(curve: OrbitCurve, spot: OrbitPoint, test: Test) -> str:
     """How the orbit meets a surface at a corner."""
     if test.kind == "rate":
         return "grazing" if is_impact(curve, spot, test.row) else "tangency"
@@ -248,7 +248,7 @@ def _touching(curve: OrbitCurve, spot: Spot, test: Test) -> str:
     return "grazing" if test.kind in ("guard", "grazing") else "corner"
 
 
-def _name(curve: OrbitCurve, kind: str, met: Met) -> str:
+def _name(curve: OrbitCurve, kind: str, met: Codim2Point) -> str:
     test = met.test
     if test.kind in (*CORNERS, "grazing"):
         touched = ", ".join(surfaces_of(curve, met.spot, test))

@@ -13,13 +13,13 @@ from jaxtyping import Array
 
 from ...derivatives._floquet import trivial
 from ...orbits.segments._equations import linearised, OrbitCurve
-from ...orbits.segments._itinerary import capacity_for, Course, EVENT, LEAST, Start
-from ...orbits.segments._point import advance, along_segment, Look, zeros_at_begin
+from ...orbits.segments._itinerary import capacity_for, Course, EVENT, GRAZING, Start
+from ...orbits.segments._point import advance, along_segment, PointData, zeros_at_begin
 from ...orbits.segments._segment_flow import with_parameter
 from ...system._parameter import get_parameter
 from ..orbits._bifurcation import Origin
 from ..orbits._test_functions import branch_value, CIRCLE, CORNERS, Test
-from ..orbits._tracer import of_circle, of_corners, Spot, spot_of
+from ..orbits._tracer import of_circle, of_corners, OrbitPoint, spot_of
 
 
 DELTA = 1e-4  # of the differences that give the gradient of a test function, in units of the surface
@@ -39,7 +39,7 @@ class Place:
     parameters is not singular, the same way along the whole curve.
     """
 
-    spot: Spot
+    spot: OrbitPoint
     along: np.ndarray
     across: np.ndarray
     slope: float
@@ -50,7 +50,9 @@ class Place:
         return dataclasses.replace(self, along=-self.along)
 
 
-def lifted(origin: Origin, path: tuple[str, ...], low: np.ndarray, high: np.ndarray) -> tuple[OrbitCurve, Spot, Test]:
+def lifted(
+    origin: Origin, path: tuple[str, ...], low: np.ndarray, high: np.ndarray
+) -> tuple[OrbitCurve, OrbitPoint, Test]:
     """A special point of a branch as one of the surface over its parameter and another one, in these intervals."""
     test, spot, curve = untouched(origin)
     first: Any = curve.path
@@ -84,7 +86,7 @@ def untouched(origin: Origin) -> Origin:
     gone = [i for i in range(n) if touches(course, i) and abs(length[i]) < 1e-5]
     kept = [i for i in range(n) if i not in gone]
     ends, xs = np.array(course.ends), np.array(look.x)
-    ends[[(i - 1) % n for i in gone]] = LEAST
+    ends[[(i - 1) % n for i in gone]] = GRAZING
     shorter = course._replace(ends=ends).take(kept, capacity_for(len(kept)))
     start = Start(shorter, look.begin[kept], look.end[kept], xs[kept])
     u = curve.pack(start, spot.parameter)
@@ -97,7 +99,7 @@ def untouched(origin: Origin) -> Origin:
 
 
 @dataclasses.dataclass
-class AbstractLocus(abc.ABC):
+class AbstractBifurcationTracer(abc.ABC):
     """A curve of special points over two parameters."""
 
     curve: OrbitCurve
@@ -106,11 +108,11 @@ class AbstractLocus(abc.ABC):
     silent: frozenset[Test] = frozenset()  # test functions that are zero all along it, or no numbers
 
     @abc.abstractmethod
-    def place(self, spot: Spot, along: np.ndarray | None = None, heading: np.ndarray | None = None) -> Place:
+    def place(self, spot: OrbitPoint, along: np.ndarray | None = None, heading: np.ndarray | None = None) -> Place:
         """A point of the curve with its direction: that which is nearer to `along`."""
 
     @abc.abstractmethod
-    def step(self, place: Place, length: float) -> Spot:
+    def step(self, place: Place, length: float) -> OrbitPoint:
         """The point of the curve at a distance along its tangent.
 
         **Raises:** `ArithmeticError` if none was found.
@@ -134,10 +136,10 @@ class AbstractLocus(abc.ABC):
 
 
 @dataclasses.dataclass
-class Locus(AbstractLocus):
+class BifurcationTracer(AbstractBifurcationTracer):
     """The curve on which a test function is zero, on the surface over two parameters."""
 
-    def at(self, spot: Spot, s: np.ndarray, guess: np.ndarray | None = None) -> Spot:
+    def at(self, spot: OrbitPoint, s: np.ndarray, guess: np.ndarray | None = None) -> OrbitPoint:
         """The point of the surface at these distances along the frame of the tangent plane at another."""
         look = spot.look
         start = look.u + s @ look.tangent if guess is None else guess
@@ -146,7 +148,7 @@ class Locus(AbstractLocus):
             raise ArithmeticError("there is no orbit")
         return spot_of(self.curve, found, spot.course)
 
-    def value(self, spot: Spot) -> float:
+    def value(self, spot: OrbitPoint) -> float:
         test, look = self.test, spot.look
         if test.kind == "fold":
             return projection(spot)
@@ -154,7 +156,7 @@ class Locus(AbstractLocus):
             return float(look.ends[test.row] / self.curve.guard_sizes[spot.course.slot[test.row]])
         return (of_corners if test.kind in CORNERS else of_circle)(self.curve, spot)[test]
 
-    def place(self, spot: Spot, along: np.ndarray | None = None, heading: np.ndarray | None = None) -> Place:
+    def place(self, spot: OrbitPoint, along: np.ndarray | None = None, heading: np.ndarray | None = None) -> Place:
         frame = spot.look.tangent
         ends = [[self.value(self.at(spot, sign * DELTA * e)) for sign in (1, -1)] for e in np.eye(2)]
         gradient = np.array([(a - b) / (2 * DELTA) for a, b in ends])
@@ -170,7 +172,7 @@ class Locus(AbstractLocus):
             found = -found
         return Place(spot, direction, across @ frame, slope, found)
 
-    def step(self, place: Place, length: float) -> Spot:
+    def step(self, place: Place, length: float) -> OrbitPoint:
         """By the secant method across the tangent."""
         frame = place.spot.look.tangent
         ahead, across = frame @ place.along, frame @ place.across
@@ -208,10 +210,10 @@ class Locus(AbstractLocus):
         return self.told(out)
 
 
-def cleared(curve: OrbitCurve, spot: Spot) -> Spot:
+def cleared(curve: OrbitCurve, spot: OrbitPoint) -> OrbitPoint:
     """With the least values of guards beside cuts at which they are zero, and least, divided by that double zero."""
     course, look, n = spot.course, spot.look, int(spot.course.num)
-    cuts = np.flatnonzero(course.ends[:n] == LEAST).tolist()
+    cuts = np.flatnonzero(course.ends[:n] == GRAZING).tolist()
     if not cuts:
         return spot
     zeros = np.asarray(zeros_at_begin(curve, curve.model, course))
@@ -221,8 +223,8 @@ def cleared(curve: OrbitCurve, spot: Spot) -> Spot:
         for row in {cut, (cut + 1) % n}:
             before = row - 1 if row else n - 1
             orders = np.zeros((2, least.shape[1]))
-            orders[0, slot] = 2 if (course.ends[before], course.slot[before]) == (LEAST, slot) else zeros[row, slot]
-            ends = {LEAST: 2, EVENT: 1}
+            orders[0, slot] = 2 if (course.ends[before], course.slot[before]) == (GRAZING, slot) else zeros[row, slot]
+            ends = {GRAZING: 2, EVENT: 1}
             orders[1, slot] = ends.get(int(course.ends[row]), 0) if course.slot[row] == slot else 0
             found = jax.device_get(_guards_along(curve, look, course, np.asarray(row), orders))
             least[row, slot], where[row, slot], spots[row, slot] = (part[slot] for part in found)
@@ -231,7 +233,7 @@ def cleared(curve: OrbitCurve, spot: Spot) -> Spot:
 
 @eqx.filter_jit
 def _guards_along(
-    curve: OrbitCurve, look: Look, course: Course, row: Array, orders: Array
+    curve: OrbitCurve, look: PointData, course: Course, row: Array, orders: Array
 ) -> tuple[Array, Array, Array]:
     """The least values of the guards along a segment, divided by zeros of these orders at its ends; where; and the
     states there."""
@@ -244,18 +246,18 @@ def _guards_along(
     return found.least[2 * n :], found.share[2 * n :], found.x[2 * n :]
 
 
-def interval_tests(spot: Spot) -> dict[Test, float]:
+def interval_tests(spot: OrbitPoint) -> dict[Test, float]:
     """Of the first and the second parameter."""
     low = {Test("low", k): float(spot.look.u[k - 2]) for k in (0, 1)}
     return low | {Test("high", k): 1 - float(spot.look.u[k - 2]) for k in (0, 1)}
 
 
-def projection(spot: Spot) -> float:
+def projection(spot: OrbitPoint) -> float:
     """Of the tangent plane on the plane of the parameters: what becomes of an area of one."""
     return float(np.linalg.det(spot.look.tangent[:, -2:]))
 
 
-def surfaces_of(curve: OrbitCurve, spot: Spot, test: Test) -> tuple[str, ...]:
+def surfaces_of(curve: OrbitCurve, spot: OrbitPoint, test: Test) -> tuple[str, ...]:
     """The switches whose surfaces are touched where a test function of `CORNERS` vanishes."""
     course, n = spot.course, int(spot.course.num)
     slots = [test.slot] if test.kind == "guard" else [int(course.slot[test.row])]
@@ -265,7 +267,7 @@ def surfaces_of(curve: OrbitCurve, spot: Spot, test: Test) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def seen_at(curve: OrbitCurve, course: Course, u: np.ndarray, border: np.ndarray) -> Spot:
+def seen_at(curve: OrbitCurve, course: Course, u: np.ndarray, border: np.ndarray) -> OrbitPoint:
     """What is seen of a point that is known to be one of the surface."""
     found = advance(curve, course, u, border, np.zeros(len(border)), u, np.asarray(False))
     return spot_of(curve, jax.device_get(found), course)

@@ -9,9 +9,9 @@ import numpy as np
 from ..._numerics._bracket import bracketed
 from ...orbits.segments._equations import linearised
 from ..orbits._test_functions import BRANCH, CORNERS, Test
-from ..orbits._tracer import FIRST, SHORTEST, Spot, TURN, TURNED
+from ..orbits._tracer import FIRST, OrbitPoint, SHORTEST, TURN, TURNED
 from ..orbits.corners._grazing import cut_course
-from ._surface import AbstractLocus, cleared, CUSP, DELTA, Locus, Place, RESONANCES, seen_at
+from ._surface import AbstractBifurcationTracer, BifurcationTracer, cleared, CUSP, DELTA, Place, RESONANCES, seen_at
 
 
 FAILED = (ArithmeticError, KeyError, np.linalg.LinAlgError)  # where an orbit, or what is asked of it, is not found
@@ -22,12 +22,12 @@ RANK = (*CORNERS, *(test.kind for test in RESONANCES), "cusp", "branch", "fold",
 LAST = (*CORNERS, "grazing", "low", "high", "1:1 resonance", "1:2 resonance")  # where the curve ends
 
 
-class Met(NamedTuple):
+class Codim2Point(NamedTuple):
     """What else vanishes at a point of the curve: of codimension two."""
 
     test: Test
     others: tuple[Test, ...]
-    spot: Spot
+    spot: OrbitPoint
     s: float = 0.0
 
 
@@ -35,14 +35,14 @@ class Met(NamedTuple):
 class Trail:
     """Points one after the other, and what is met at some of them; `end` is the last if it ends the curve."""
 
-    spots: list[Spot]
-    met: list[tuple[int, Met]] = dataclasses.field(default_factory=list)
-    end: Met | None = None
+    spots: list[OrbitPoint]
+    met: list[tuple[int, Codim2Point]] = dataclasses.field(default_factory=list)
+    end: Codim2Point | None = None
     why: str = ""
     closed: bool = False
 
 
-def trace(locus: AbstractLocus, place: Place, max_step: float, max_points: int) -> Trail:
+def trace(locus: AbstractBifurcationTracer, place: Place, max_step: float, max_points: int) -> Trail:
     """Follows the curve from a point in the direction that it has there."""
     out, begin, length, steps = Trail([place.spot]), place, FIRST, 0
     while len(out.spots) < max_points:
@@ -80,19 +80,19 @@ def trace(locus: AbstractLocus, place: Place, max_step: float, max_points: int) 
     return out
 
 
-def _beyond(spot: Spot, end: Spot, place: Place) -> bool:
+def _beyond(spot: OrbitPoint, end: OrbitPoint, place: Place) -> bool:
     """In the parameters: the orbits are cut differently."""
     return float((spot.look.u[-2:] - end.look.u[-2:]) @ place.along[-2:]) > 0
 
 
-def _passes(locus: AbstractLocus, place: Place, begin: Place, length: float) -> bool:
+def _passes(locus: AbstractBifurcationTracer, place: Place, begin: Place, length: float) -> bool:
     s = float(place.along @ (begin.spot.look.u - place.spot.look.u))
     if not 0 < s <= length or place.along @ begin.along < 0.5:
         return False
     return bool(np.max(np.abs(locus.step(place, s).look.u - begin.spot.look.u)) < 1e-6)
 
 
-def _met(locus: AbstractLocus, place: Place, after: Place, length: float) -> list[Met]:
+def _met(locus: AbstractBifurcationTracer, place: Place, after: Place, length: float) -> list[Codim2Point]:
     """What vanishes between two points, in its order, up to the end of the curve."""
     old, new = locus.watched(place), locus.watched(after)
     found = []
@@ -105,7 +105,7 @@ def _met(locus: AbstractLocus, place: Place, after: Place, length: float) -> lis
     found = [met for met in found if _told(locus, met)]
     rank = {kind: i for i, kind in enumerate(RANK)}
     found.sort(key=lambda met: met.s)
-    out: list[Met] = []
+    out: list[Codim2Point] = []
     while found:
         near = [met for met in found if met.s - found[0].s <= TOGETHER * length]
         found = found[len(near) :]
@@ -116,7 +116,7 @@ def _met(locus: AbstractLocus, place: Place, after: Place, length: float) -> lis
     return out
 
 
-def _told(locus: AbstractLocus, met: Met) -> bool:
+def _told(locus: AbstractBifurcationTracer, met: Codim2Point) -> bool:
     """Two real multipliers with the product 1 bifurcate only where both are 1, or -1."""
     if met.test.kind != "Neimark-Sacker":
         return True
@@ -127,13 +127,13 @@ def _told(locus: AbstractLocus, met: Met) -> bool:
     return bool(pair or double)
 
 
-def _located(locus: AbstractLocus, place: Place, after: Place, length: float, test: Test) -> Met:
-    seen: dict[float, Spot] = {0.0: place.spot, length: after.spot}
+def _located(locus: AbstractBifurcationTracer, place: Place, after: Place, length: float, test: Test) -> Codim2Point:
+    seen: dict[float, OrbitPoint] = {0.0: place.spot, length: after.spot}
 
-    def step(s: float) -> Spot:
+    def step(s: float) -> OrbitPoint:
         return locus.step(place, s)
 
-    def value(spot: Spot) -> float:
+    def value(spot: OrbitPoint) -> float:
         here = locus.place(spot, place.along, place.heading) if test == CUSP else dataclasses.replace(place, spot=spot)
         return locus.watched(here)[test]
 
@@ -151,16 +151,21 @@ def _located(locus: AbstractLocus, place: Place, after: Place, length: float, te
         near = min(seen, key=lambda t: abs(t - s))
         return _interpolated(locus, place, max(near, 0.1 * length), length, test, value)
     spot = seen[s]
-    if test.kind == "guard" and isinstance(locus, Locus):
+    if test.kind == "guard" and isinstance(locus, BifurcationTracer):
         exact = _cut(locus, spot, test)
         if exact is not None:
-            return Met(Test("grazing", test.row, test.slot), (), exact, s)
-    return Met(test, (), spot, s)
+            return Codim2Point(Test("grazing", test.row, test.slot), (), exact, s)
+    return Codim2Point(test, (), spot, s)
 
 
 def _interpolated(
-    locus: AbstractLocus, place: Place, s: float, length: float, test: Test, value: Callable[[Spot], float]
-) -> Met:
+    locus: AbstractBifurcationTracer,
+    place: Place,
+    s: float,
+    length: float,
+    test: Test,
+    value: Callable[[OrbitPoint], float],
+) -> Codim2Point:
     """A point at which the equations are singular, by polynomials through points of the curve on both sides of it."""
     shares, values, spots = [], [], []
     for share in (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0):
@@ -187,10 +192,10 @@ def _interpolated(
     rho = np.linalg.eigvals(monodromy)
     rho = rho[np.argsort(-np.abs(rho))].astype(complex)
     spot = dataclasses.replace(spot, monodromy=monodromy, multipliers=rho)
-    return Met(test, (), spot, s + 0.5 * length * root)
+    return Codim2Point(test, (), spot, s + 0.5 * length * root)
 
 
-def _cut(locus: Locus, spot: Spot, test: Test) -> Spot | None:
+def _cut(locus: BifurcationTracer, spot: OrbitPoint, test: Test) -> OrbitPoint | None:
     """The point of the curve at which the least value of a guard is zero exactly: the orbit cut there."""
     start, rows = cut_course(locus.curve, cleared(locus.curve, spot), [(test.row, test.slot)])
     row = rows[test.row, test.slot]
@@ -207,7 +212,7 @@ def _cut(locus: Locus, spot: Spot, test: Test) -> Spot | None:
         return None
 
 
-def meet(first: Locus, second: Locus, spot: Spot) -> Spot:
+def meet(first: BifurcationTracer, second: BifurcationTracer, spot: OrbitPoint) -> OrbitPoint:
     """Where two test functions vanish, by Newton's method on the surface."""
     for _ in range(12):
         here = np.array([first.value(spot), second.value(spot)])

@@ -13,7 +13,7 @@ import numpy as np
 from ..._types import Y
 from ...equilibria._equilibrium import Equilibrium, nearest_state
 from ...equilibria._find_equilibrium import checked_equilibrium, find_equilibrium
-from ...system._model import Model
+from ...system._model import SwitchedSystem
 from ...system._parameter import get_parameter, parameter_path
 from ...system._system import System
 from ._branch import Branch, branch_of, Strand
@@ -96,7 +96,7 @@ def continue_equilibrium(
             f"Argument `interval` must be (low, high) and hold {value:.6g}, the value of `{parameter}` in `system`, "
             f"but is ({low:.6g}, {high:.6g})."
         )
-    model = Model(checked, jnp.ones_like(t), t, y)
+    model = SwitchedSystem(checked, jnp.ones_like(t), t, y)
     size = len(jfu.ravel_pytree(y)[0]) + len(model.holdable) + 1
     mark = jnp.asarray((value - low) / (high - low), t.dtype)
     curve = EquilibriumCurve(model, path, t, y, jnp.asarray(low, t.dtype), mark, jnp.ones(size, t.dtype))

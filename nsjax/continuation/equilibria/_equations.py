@@ -19,7 +19,7 @@ from ...equilibria._equilibrium import (
     stacked_values,
     switch_values,
 )
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 from ...system._parameter import put_parameter
 from ...system._system import impact, relay, sgn
 from ._corrector import Curve
@@ -46,7 +46,7 @@ class EquilibriumCurve(Curve):
     A mode has the modes of the switches in its first row, and in its second the component of h on which each is held.
     """
 
-    model: Model
+    model: SwitchedSystem
     path: tuple[str, ...] = eqx.field(static=True)
     t: Scalar
     like: Y
@@ -55,20 +55,20 @@ class EquilibriumCurve(Curve):
     units: Float[Array, " n+1"]
 
     def parts(self, u: Array) -> tuple[Array, Array, Scalar]:
-        """State, values of the holdable switches, parameter."""
+        """ModeState, values of the holdable switches, parameter."""
         z = u * self.units
         n = len(u) - 1 - len(self.model.holdable)
         return z[:n], z[n:-1], self.low + z[-1]
 
-    def at(self, u: Array) -> tuple[Model, Y, Array]:
+    def at(self, u: Array) -> tuple[SwitchedSystem, Y, Array]:
         x, sigma, value = self.parts(u)
         system = put_parameter(self.model.system, self.path, value)
         return eqx.tree_at(lambda m: m.system, self.model, system), jfu.ravel_pytree(self.like)[1](x), sigma
 
-    def state(self, mode: Int[Array, "2 switches"]) -> State:
+    def state(self, mode: Int[Array, "2 switches"]) -> ModeState:
         several = [n > 1 and not isinstance(k, relay) for n, k in zip(self.model.parts, self.model.switches)]
         part = tuple(p if on else None for p, on in zip(mode[1], several))
-        return State(tuple(mode[0]), part, tuple(jnp.zeros_like(m) for m in mode[0]))
+        return ModeState(tuple(mode[0]), part, tuple(jnp.zeros_like(m) for m in mode[0]))
 
     def residual(self, u: Array, mode: Array) -> Array:
         model, y, sigma = self.at(u)

@@ -14,7 +14,7 @@ from ...orbits.segments._equations import OrbitCurve
 from ...setvalued._pencil import EigenvalueCrossing
 from ..equilibria._bifurcation import half_branch
 from ._test_functions import Test
-from ._tracer import Spot
+from ._tracer import OrbitPoint
 
 
 SMOOTH = {kind: kind for kind in ("fold", "flip", "Neimark-Sacker")}  # and the test function that tells it
@@ -25,7 +25,7 @@ class Origin(NamedTuple):
     """A special point as the continuation saw it: what vanishes there, where, and on which curve."""
 
     test: Test
-    spot: Spot
+    spot: OrbitPoint
     curve: OrbitCurve
 
     def __repr__(self) -> str:

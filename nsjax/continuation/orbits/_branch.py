@@ -17,14 +17,14 @@ from ...orbits._find_orbit import find_orbit
 from ...orbits._orbit import Orbit
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._guess import Segment
-from ...orbits.segments._itinerary import FREE, LEAST, TIME
+from ...orbits.segments._itinerary import GRAZING, REPELLING_EXIT, TIME
 from ...setvalued._pencil import EigenvalueCrossing
 from ...system._parameter import parameter_path, put_parameter
 from ...system._system import System
 from .._archive import Archive, save, table
 from ._bifurcation import OrbitBifurcation, OrbitHalf, Origin
 from ._record import states_of
-from ._tracer import midpoint, Spot
+from ._tracer import midpoint, OrbitPoint
 
 
 NOT_BIFURCATIONS = ("none", "end")
@@ -178,7 +178,7 @@ class Point(NamedTuple):
     """A point of a strand, of how many periods of the forcing its orbit is, the user's measures of it, and whether the
     system has such an orbit."""
 
-    spot: Spot
+    spot: OrbitPoint
     order: int
     record: dict[str, np.ndarray]
     admissible: bool
@@ -262,7 +262,7 @@ def orbit_branch(
     )
 
 
-def segments_of(curve: OrbitCurve, spot: Spot, t: float) -> tuple[Segment, ...]:
+def segments_of(curve: OrbitCurve, spot: OrbitPoint, t: float) -> tuple[Segment, ...]:
     """The segments of an orbit from a time within one of them on; that one comes first and last."""
     look, course, model = spot.look, spot.course, curve.model
     modes = [tuple(course.mode[i].tolist()) for i in course.rows]
@@ -275,8 +275,8 @@ def segments_of(curve: OrbitCurve, spot: Spot, t: float) -> tuple[Segment, ...]:
     for i in [*range(first, len(modes)), *range(first)]:
         if i != first:
             duration += lengths[i]
-        if course.ends[i] != LEAST:  # a cut that changes nothing
+        if course.ends[i] != GRAZING:  # a cut that changes nothing
             switch = model.switches[model.slots[int(course.slot[i])].switch].name
-            out.append(Segment(modes[i], duration, switch, bool(course.ends[i] == FREE)))
+            out.append(Segment(modes[i], duration, switch, bool(course.ends[i] == REPELLING_EXIT)))
             duration = 0.0
     return (*out, Segment(modes[first], duration + float(t - look.begin[first])))

@@ -12,7 +12,7 @@ from ...orbits.segments._itinerary import capacity_for, Course, Start, TIME
 from ...orbits.segments._point import advance
 from ._bifurcation import OrbitBifurcation, OrbitHalf
 from ._test_functions import CORNERS
-from ._tracer import alike, midpoint, OrbitTracer, Spot, spot_of, told_by, turned, Zero
+from ._tracer import alike, midpoint, OrbitPoint, OrbitTracer, spot_of, told_by, turned, Zero
 
 
 BRANCHING = (3e-3, 1e-3, 1e-2, 3e-4, 1e-4, 1e-5)  # lengths of the step by which a branch is entered along its direction
@@ -24,7 +24,7 @@ MOST_LAPS = 8  # in which an autonomous orbit may pass through the same points s
 class Half:
     """A half-branch: the orbit on it next to the point, with its tangent away from it."""
 
-    spot: Spot
+    spot: OrbitPoint
     curve: OrbitCurve  # whose `order` is that of these orbits
     laps: int
     side: int
@@ -46,7 +46,7 @@ class Half:
 class Node:
     """A point at which half-branches meet, those that go on into one another being partners."""
 
-    spot: Spot
+    spot: OrbitPoint
     order: int
     halves: list[Half]
     bifurcation: OrbitBifurcation
@@ -57,7 +57,7 @@ class Node:
         return smooth != self.bifurcation.discontinuous and together(self.spot, zero.spot, curve, ALIKE)
 
 
-def together(a: Spot, b: Spot, curve: OrbitCurve, tolerance: float) -> bool:
+def together(a: OrbitPoint, b: OrbitPoint, curve: OrbitCurve, tolerance: float) -> bool:
     """Whether two are the same orbit at the same parameter."""
     return abs(a.parameter - b.parameter) < tolerance * float(curve.width) and alike(a, b, curve, tolerance)
 
@@ -74,7 +74,7 @@ def _kernel(tracer: OrbitTracer, course: Course, u: Any) -> np.ndarray:
     return np.linalg.svd(np.asarray(linearised(tracer.curve, course, u)))[2][-2:]
 
 
-def set_out(tracer: OrbitTracer, course: Course, u: Any, direction: np.ndarray) -> Spot | None:
+def set_out(tracer: OrbitTracer, course: Course, u: Any, direction: np.ndarray) -> OrbitPoint | None:
     """An orbit on the branch that leaves `u` in this direction, with its tangent away from it."""
     for step in BRANCHING:
         look = advance(
@@ -88,16 +88,16 @@ def set_out(tracer: OrbitTracer, course: Course, u: Any, direction: np.ndarray) 
     return None
 
 
-def _along(spot: Spot, direction: np.ndarray) -> Spot:
+def _along(spot: OrbitPoint, direction: np.ndarray) -> OrbitPoint:
     return spot if float(spot.look.tangent @ direction) >= 0 else turned(spot)
 
 
-def admissible(curve: OrbitCurve, spot: Spot) -> bool:
+def admissible(curve: OrbitCurve, spot: OrbitPoint) -> bool:
     scale = float(spot.look.branch[1])
     return all(v > -1e-9 for t, v in told_by(curve, spot, scale).items() if t.kind in CORNERS)
 
 
-def _repeated(spot: Spot, times: int, period: float) -> tuple[Course, Start]:
+def _repeated(spot: OrbitPoint, times: int, period: float) -> tuple[Course, Start]:
     """The orbit several times."""
     n = int(spot.course.num)
     rows = list(range(n)) * times
@@ -111,7 +111,7 @@ def _repeated(spot: Spot, times: int, period: float) -> tuple[Course, Start]:
     return course, Start(course, *first, np.tile(look.x[:n], (times, 1)))
 
 
-def flip_at(tracer: OrbitTracer, name: str, spot: Spot) -> Node | None:
+def flip_at(tracer: OrbitTracer, name: str, spot: OrbitPoint) -> Node | None:
     """Where a multiplier is -1: the orbit twice is a branch point of orbits of twice the period."""
     curve = tracer.curve
     course, start = _repeated(spot, 2, float(spot.look.period))
@@ -136,7 +136,7 @@ def _across(kernel: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     return direction / np.linalg.norm(direction)
 
 
-def branch_point_at(tracer: OrbitTracer, name: str, spot: Spot) -> Node | None:
+def branch_point_at(tracer: OrbitTracer, name: str, spot: OrbitPoint) -> Node | None:
     """Where a multiplier is 1 and another branch crosses."""
     curve = tracer.curve
     n = int(spot.course.num)
@@ -176,7 +176,7 @@ def branch_point_at(tracer: OrbitTracer, name: str, spot: Spot) -> Node | None:
     return Node(spot, int(curve.order), halves, made)
 
 
-def cover_of(spot: Spot, curve: OrbitCurve, tolerance: float = 1e-4) -> int:
+def cover_of(spot: OrbitPoint, curve: OrbitCurve, tolerance: float = 1e-4) -> int:
     """How many times the orbit passes through the same points."""
     look, n, order = spot.look, int(spot.course.num), int(curve.order)
     period = float(look.period)
@@ -193,7 +193,7 @@ def cover_of(spot: Spot, curve: OrbitCurve, tolerance: float = 1e-4) -> int:
     return next((k for k in several if away(k) < tolerance), 1)
 
 
-def side_of(half: Spot, at: Spot, curve: OrbitCurve) -> int:
+def side_of(half: OrbitPoint, at: OrbitPoint, curve: OrbitCurve) -> int:
     return int(np.sign(half.parameter - at.parameter)) or int(np.sign(half.look.tangent[-1]))
 
 

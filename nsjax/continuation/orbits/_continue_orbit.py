@@ -16,7 +16,7 @@ from ...orbits._orbit import Orbit
 from ...orbits.segments._arcs import model_of
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import Course
-from ...orbits.segments._point import Look
+from ...orbits.segments._point import PointData
 from ...system._parameter import get_parameter, parameter_path
 from ...system._system import System
 from .._archive import Archive, plain, save, table
@@ -24,17 +24,33 @@ from .._progress import ProgressLine
 from ._bifurcation import Origin
 from ._branch import orbit_branch, OrbitBranch, OrbitStrand, Point, TYPES as OF_BRANCHES
 from ._branch_switching import Half, itinerary, Node
-from ._explorer import Exit, OrbitExplorer, OrbitTree, Walk
+from ._explorer import Exit, Frontier, OrbitExplorer, OrbitTree
 from ._record import Measures, Recorder
 from ._start import curve_and_start, options
 from ._test_functions import Test
-from ._tracer import Arc, OrbitTracer, Spot, Zero
+from ._tracer import Arc, OrbitPoint, OrbitTracer, Zero
 
 
 GIVEN = ("model", "path", "like", "how")  # what of a curve follows from the model, and is not saved
 TYPES = {
     **OF_BRANCHES,
-    **table(OrbitTree, Walk, Origin, Exit, Arc, Zero, Test, Spot, Look, Course, Node, Half, Cycle, OrbitStrand, Point),
+    **table(
+        OrbitTree,
+        Frontier,
+        Origin,
+        Exit,
+        Arc,
+        Zero,
+        Test,
+        OrbitPoint,
+        PointData,
+        Course,
+        Node,
+        Half,
+        Cycle,
+        OrbitStrand,
+        Point,
+    ),
 }
 
 
@@ -112,7 +128,7 @@ def continue_orbit(
     **Raises:** `ValueError` for an unknown parameter, a value outside the interval, an orbit that was not found or is
     not admissible, a function of `record` that fails or gives arrays of different shapes, and in single precision.
     """
-    growth = OrbitGrowth(
+    growth = OrbitContinuation(
         system, orbit, parameter, interval, scale=scale, max_step=max_step, max_points=max_points,
         max_branches=max_branches, max_laps=max_laps, virtual=virtual, record=record, solver=solver,
         stepsize_controller=stepsize_controller, max_steps=max_steps,
@@ -125,18 +141,18 @@ def continue_orbit(
 
 
 @shown
-class OrbitGrowth(Generic[StateT]):
+class OrbitContinuation(Generic[StateT]):
     """A continuation that is under way: iterate over it, and look at `branch` at any time.
 
     ```python
-    growth = nsjax.OrbitGrowth(system, orbit, "omega", (0.5, 2.0))
+    growth = nsjax.OrbitContinuation(system, orbit, "omega", (0.5, 2.0))
     for point in tqdm(growth):
         if point.parameter > 1.9:
             break
     print(growth)  # how far it is
     print(growth.branch)  # what there is so far; go on iterating for more
     growth.save("growth.npz")
-    growth = nsjax.OrbitGrowth.load("growth.npz", system)  # some other day
+    growth = nsjax.OrbitContinuation.load("growth.npz", system)  # some other day
     ```
 
     An interrupt (Ctrl-C), wherever it comes, leaves a growth that can be gone on with. The arguments are those of
@@ -173,10 +189,10 @@ class OrbitGrowth(Generic[StateT]):
         )
         self._tree = self._explorer.planted(spot)
 
-    def __iter__(self) -> "OrbitGrowth[StateT]":
+    def __iter__(self) -> "OrbitContinuation[StateT]":
         return self
 
-    def __next__(self) -> Spot:
+    def __next__(self) -> OrbitPoint:
         while self._tree.walk is not None:
             self._tree, point = self._explorer.further(self._tree)
             if self._tree.walk is None and next(self._tree.places(), None) is not None:
@@ -216,7 +232,7 @@ class OrbitGrowth(Generic[StateT]):
             explorer={name: getattr(explorer, name) for name in ("name", "max_branches", "max_order", "virtual")},
             tree=self._tree,
         )
-        save(path, "OrbitGrowth", TYPES, curve.model.system, curve.like, parts, curve=curve)
+        save(path, "OrbitContinuation", TYPES, curve.model.system, curve.like, parts, curve=curve)
 
     @classmethod
     def load(
@@ -229,7 +245,7 @@ class OrbitGrowth(Generic[StateT]):
         solver: dfx.AbstractSolver = dfx.Dopri8(),
         stepsize_controller: dfx.AbstractStepSizeController | None = None,
         max_steps: int = 4096,
-    ) -> "OrbitGrowth":
+    ) -> "OrbitContinuation":
         """Reads what `save` wrote, to go on with it as if nothing had happened. Nothing in the file is executed.
 
         **Arguments:**
@@ -243,7 +259,7 @@ class OrbitGrowth(Generic[StateT]):
         **Raises:** `ValueError` for a file that is damaged, is none of `save`'s, or is of another model or solver,
         or has other records.
         """
-        archive = Archive(path, "OrbitGrowth", TYPES, system, y)
+        archive = Archive(path, "OrbitContinuation", TYPES, system, y)
         how = options(solver, stepsize_controller, max_steps)
         if plain(repr(how)) != archive.part("how"):
             raise ValueError(

@@ -13,7 +13,7 @@ from ._branch import OrbitStrand, Point
 from ._branch_switching import admissible, Half, Node, tracer_for
 from ._record import Recorder
 from ._test_functions import CORNERS, PASSED
-from ._tracer import alike, Arc, OrbitTracer, SAME, Spot, turned
+from ._tracer import alike, Arc, OrbitPoint, OrbitTracer, SAME, turned
 from .corners._corner import node_at
 from .corners._grazing import exactly
 
@@ -27,12 +27,12 @@ class Exit(NamedTuple):
 
     name: str
     curve: OrbitCurve
-    corner: Spot
-    spot: Spot
+    corner: OrbitPoint
+    spot: OrbitPoint
 
 
 @dataclasses.dataclass(frozen=True)
-class Walk:
+class Frontier:
     """What grows: the second strand of the last branch, or after that its first.
 
     - `arc`: the last arc of the strand, on a `curve`.
@@ -60,9 +60,9 @@ class OrbitTree:
     - `walk`: what is under way; None when all is done.
     """
 
-    start: Spot
+    start: OrbitPoint
     branches: tuple[tuple[OrbitStrand, OrbitStrand], ...]
-    walk: Walk | None
+    walk: Frontier | None
     nodes: tuple[Node, ...] = ()
     used: tuple[Place, ...] = ()
     exits: tuple[Exit, ...] = ()
@@ -106,14 +106,14 @@ class OrbitExplorer:
     recorder: Recorder
     virtual: bool
 
-    def planted(self, spot: Spot) -> OrbitTree:
+    def planted(self, spot: OrbitPoint) -> OrbitTree:
         """Nothing but a first orbit."""
         spot = spot if spot.look.tangent[-1] >= 0 else turned(spot)
         ahead = OrbitStrand((self.point(spot, self.tracer.curve),))
-        walk = Walk(self.tracer.curve, Arc((spot,), begin=spot))
+        walk = Frontier(self.tracer.curve, Arc((spot,), begin=spot))
         return OrbitTree(spot, ((OrbitStrand(end="the start"), ahead),), walk)
 
-    def further(self, tree: OrbitTree) -> tuple[OrbitTree, Spot | None]:
+    def further(self, tree: OrbitTree) -> tuple[OrbitTree, OrbitPoint | None]:
         """The next point; or None where a branch does something else than going on."""
         walk = tree.walk
         assert walk is not None
@@ -131,7 +131,7 @@ class OrbitExplorer:
             strand = strand if made is None else strand.noting(made)
         return tree.growing(strand), spot
 
-    def point(self, spot: Spot, curve: OrbitCurve, admissible: bool = True) -> Point:
+    def point(self, spot: OrbitPoint, curve: OrbitCurve, admissible: bool = True) -> Point:
         return Point(spot, int(curve.order), self.recorder(curve, spot), admissible)
 
     def passed(self, tree: OrbitTree, tracer: OrbitTracer, arc: Arc) -> tuple[OrbitTree, OrbitBifurcation | None]:
@@ -150,7 +150,7 @@ class OrbitExplorer:
             side = 1 if arc.spots[-2].parameter > zero.spot.parameter else -1
         return tree, OrbitBifurcation.smooth(zero.test.kind, self.name, zero.spot, curve, [], side)
 
-    def turn(self, tree: OrbitTree, walk: Walk) -> OrbitTree:
+    def turn(self, tree: OrbitTree, walk: Frontier) -> OrbitTree:
         """What there is at the end of an arc: a way on through a corner or a branch point, or the end of the strand."""
         arc, zero = walk.arc, walk.arc.end
         tracer, order = tracer_for(self.tracer, walk.curve), int(walk.curve.order)
@@ -181,7 +181,7 @@ class OrbitExplorer:
         tree = tree.growing(tree.strand.ending(self.point(last, walk.curve)).noting(node.bifurcation))
         return self.ended(tree, self.named(node)) if ahead is None else self.departed(tree, ahead, arc.begin)
 
-    def departed(self, tree: OrbitTree, place: Place, begin: Spot | None = None) -> OrbitTree:
+    def departed(self, tree: OrbitTree, place: Place, begin: OrbitPoint | None = None) -> OrbitTree:
         """On a half-branch: with the point itself, and the multipliers that the half-branch has there."""
         walk, (at, _) = tree.walk, place
         assert walk is not None
@@ -208,7 +208,7 @@ class OrbitExplorer:
             return self.escaped(tree)
         if not walk.back and walk.origin is None and why != CLOSED:
             spot = turned(tree.start)
-            walk = Walk(self.tracer.curve, Arc((spot,), begin=spot), back=True)
+            walk = Frontier(self.tracer.curve, Arc((spot,), begin=spot), back=True)
             tree = dataclasses.replace(tree, walk=walk)
             return tree.growing(OrbitStrand((self.point(spot, walk.curve),)))
         if not walk.back and walk.origin is not None:
@@ -227,7 +227,7 @@ class OrbitExplorer:
         """A course, at a corner: if virtual orbits are asked for."""
         return dataclasses.replace(tree, exits=(*tree.exits, exit)) if self.virtual else tree
 
-    def behind(self, node: Node, half: Half) -> Spot | None:
+    def behind(self, node: Node, half: Half) -> OrbitPoint | None:
         """A corner in the course of a half-branch that leaves it, looking the other way."""
         tracer, arc = tracer_for(self.tracer, half.curve), Arc((turned(half.spot),))
         while not arc.over and len(arc.spots) < NEARBY:
@@ -244,7 +244,7 @@ class OrbitExplorer:
             return dataclasses.replace(tree, walk=None)
         exit, *others = tree.exits
         new = OrbitStrand(end=exit.name), OrbitStrand((self.point(exit.corner, exit.curve, False),))
-        walk = Walk(exit.curve, Arc((exit.spot,)), virtual=True)
+        walk = Frontier(exit.curve, Arc((exit.spot,)), virtual=True)
         return dataclasses.replace(tree, branches=(*tree.branches, new), exits=tuple(others), walk=walk)
 
     def arrived(self, tracer: OrbitTracer, node: Node, arc: Arc) -> int | None:
@@ -278,7 +278,7 @@ class OrbitExplorer:
         return f"{node.bifurcation.name} at {self.name} = {node.bifurcation.value:.6g}"
 
 
-def outwards(arc: Arc) -> Spot:
+def outwards(arc: Arc) -> OrbitPoint:
     """The last point of an arc, with the way that the arc came for its tangent: at a corner that touches at several
     places at once the equations are singular, a segment of no length at each going its own way."""
     before, at = arc.spots[-2:]

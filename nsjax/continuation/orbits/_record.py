@@ -9,7 +9,7 @@ import numpy as np
 
 from ..._types import Y
 from ...orbits.segments._equations import OrbitCurve
-from ._tracer import Spot
+from ._tracer import OrbitPoint
 
 
 Measures = Mapping[str, Callable[[np.ndarray, Y], Any]]
@@ -34,7 +34,7 @@ class Recorder:
             if not isinstance(name, str) or not callable(measure):
                 raise ValueError(f"Argument `record` must map names to functions, but maps {name!r} to {measure!r}.")
 
-    def __call__(self, curve: OrbitCurve, spot: Spot) -> dict[str, np.ndarray]:
+    def __call__(self, curve: OrbitCurve, spot: OrbitPoint) -> dict[str, np.ndarray]:
         if not self.measures:
             return {}
         n, look = int(spot.course.num), spot.look

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 from ...derivatives._floquet import trivial
 from ...orbits.segments._equations import OrbitCurve
-from ...orbits.segments._itinerary import Course, EVENT, FREE, LEAST
-from ...orbits.segments._point import Look
+from ...orbits.segments._itinerary import Course, EVENT, GRAZING, REPELLING_EXIT
+from ...orbits.segments._point import PointData
 
 
 PASSED = ("fold", "flip", "Neimark-Sacker")  # bifurcations through which the branch goes on as it is
@@ -33,7 +33,7 @@ def corner_tests(rows: int, slots: int) -> list[Test]:
     return of_segments + [Test("guard", i, j) for i in range(rows) for j in range(slots)]
 
 
-def corner_values(curve: OrbitCurve, look: Look, course: Course) -> tuple[Any, Any]:
+def corner_values(curve: OrbitCurve, look: PointData, course: Course) -> tuple[Any, Any]:
     """Positive as long as the orbit is one; and which of these there are."""
     xp = look.begin.__array_namespace__()
     index = xp.arange(len(look.begin), dtype=course.num.dtype)
@@ -42,15 +42,15 @@ def corner_values(curve: OrbitCurve, look: Look, course: Course) -> tuple[Any, A
     ends_before, ends_after = ends[xp.where(index == 0, last, index - 1)], ends[xp.where(index >= last, 0, index + 1)]
     values = [-look.rates, look.margins, (look.end - look.begin) / curve.time, look.least.ravel()]
     there = [
-        real & event & (ends_after != FREE),
+        real & event & (ends_after != REPELLING_EXIT),
         real & event & xp.isfinite(look.margins),
-        real & (course.num > 1) & (ends != LEAST) & (ends_before != LEAST),
+        real & (course.num > 1) & (ends != GRAZING) & (ends_before != GRAZING),
         (real[:, None] & xp.isfinite(look.least)).ravel(),
     ]
     return xp.concatenate(values), xp.concatenate(there)
 
 
-def branch_value(look: Look, log: Any) -> Any:
+def branch_value(look: PointData, log: Any) -> Any:
     """The determinant of the equations bordered by the tangent, over exp(log)."""
     sign, size = look.branch
     xp = sign.__array_namespace__()

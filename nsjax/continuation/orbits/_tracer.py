@@ -10,7 +10,7 @@ import numpy as np
 from ..._numerics._bracket import bracketed
 from ...orbits.segments._equations import OrbitCurve, state_at
 from ...orbits.segments._itinerary import Course
-from ...orbits.segments._point import advance, Look
+from ...orbits.segments._point import advance, PointData
 from ._test_functions import (
     BRANCH,
     branch_value,
@@ -36,10 +36,10 @@ ASIDE = 1e-2  # from a branch point, in steps: a fold that is nearer is the bran
 
 
 @dataclasses.dataclass
-class Spot:
+class OrbitPoint:
     """A point of a branch: what is seen there, its course, and its multipliers."""
 
-    look: Look
+    look: PointData
     course: Course
     multipliers: np.ndarray
     stable: bool
@@ -50,12 +50,12 @@ class Spot:
         return float(self.look.parameter)
 
 
-def spot_of(curve: OrbitCurve, look: Look, course: Course) -> Spot:
+def spot_of(curve: OrbitCurve, look: PointData, course: Course) -> OrbitPoint:
     look = jax.device_get(look)
-    return Spot(look, course, look.multipliers, bool(look.stable), look.monodromy)
+    return OrbitPoint(look, course, look.multipliers, bool(look.stable), look.monodromy)
 
 
-def midpoint(curve: OrbitCurve, spot: Spot, rows: Iterable[int]) -> tuple[float, np.ndarray, np.ndarray]:
+def midpoint(curve: OrbitCurve, spot: OrbitPoint, rows: Iterable[int]) -> tuple[float, np.ndarray, np.ndarray]:
     """Time, state and mode in the middle of the longest of some segments, if possible one that no surface holds: beside
     it orbits are near each other, as they need not be beside an event or where static friction holds."""
     look, course = spot.look, spot.course
@@ -70,7 +70,7 @@ def midpoint(curve: OrbitCurve, spot: Spot, rows: Iterable[int]) -> tuple[float,
     return float(t), np.asarray(x), mode
 
 
-def told_by(curve: OrbitCurve, spot: Spot, log: float) -> dict[Test, float]:
+def told_by(curve: OrbitCurve, spot: OrbitPoint, log: float) -> dict[Test, float]:
     """All test functions of a point; the determinant is divided by exp(log)."""
     share = float(spot.look.u[-1])
     ends = {Test("low"): share, Test("high"): 1 - share}
@@ -78,13 +78,13 @@ def told_by(curve: OrbitCurve, spot: Spot, log: float) -> dict[Test, float]:
     return ends | of_corners(curve, spot) | smooth | of_circle(curve, spot)
 
 
-def of_corners(curve: OrbitCurve, spot: Spot) -> dict[Test, float]:
+def of_corners(curve: OrbitCurve, spot: OrbitPoint) -> dict[Test, float]:
     values, there = corner_values(curve, spot.look, spot.course)
     names = corner_tests(*spot.look.least.shape)
     return {names[i]: float(values[i]) for i in np.flatnonzero(there)}
 
 
-def of_circle(curve: OrbitCurve, spot: Spot) -> dict[Test, float]:
+def of_circle(curve: OrbitCurve, spot: OrbitPoint) -> dict[Test, float]:
     return dict(zip(CIRCLE, circle_values(spot.multipliers, curve.autonomous).tolist()))
 
 
@@ -94,7 +94,7 @@ class Zero(NamedTuple):
 
     s: float
     test: Test
-    spot: Spot
+    spot: OrbitPoint
     others: tuple[Test, ...] = ()
     side: int = 0
 
@@ -112,11 +112,11 @@ class Arc:
     - `why`, `closed`: why there is no other; whether because it has been all round.
     """
 
-    spots: tuple[Spot, ...]
-    begin: Spot | None = None
+    spots: tuple[OrbitPoint, ...]
+    begin: OrbitPoint | None = None
     length: float = FIRST
     steps: int = 0
-    ahead: tuple[Spot | Zero, ...] = ()
+    ahead: tuple[OrbitPoint | Zero, ...] = ()
     at: Zero | None = None
     why: str = ""
     closed: bool = False
@@ -140,7 +140,7 @@ class OrbitTracer:
     max_points: int
     virtual: bool = False
 
-    def at(self, spot: Spot, s: float, guess: Any = None) -> Spot | None:
+    def at(self, spot: OrbitPoint, s: float, guess: Any = None) -> OrbitPoint | None:
         """The point at the distance `s` along the tangent of another."""
         look = spot.look
         guess = look.u + s * look.tangent if guess is None else guess
@@ -149,12 +149,12 @@ class OrbitTracer:
         )
         return spot_of(self.curve, found, spot.course) if bool(found.good) else None
 
-    def between(self, a: Spot, b: Spot, value: float) -> Spot | None:
+    def between(self, a: OrbitPoint, b: OrbitPoint, value: float) -> OrbitPoint | None:
         """The point between two others at which the parameter has this value."""
         length = float(a.look.tangent @ (b.look.u - a.look.u))
         seen = {0.0: a, length: b}
 
-        def at(s: float) -> Spot | None:
+        def at(s: float) -> OrbitPoint | None:
             return self.at(a, s, a.look.u + s / length * (b.look.u - a.look.u))
 
         try:
@@ -162,7 +162,7 @@ class OrbitTracer:
         except (ArithmeticError, ValueError):
             return None
 
-    def corrected(self, course: Course, guess: Any, border: Any = None) -> Spot | None:
+    def corrected(self, course: Course, guess: Any, border: Any = None) -> OrbitPoint | None:
         """The orbit in a course next to a guess, at the same parameter (or on another plane)."""
         border = np.eye(len(guess))[-1] if border is None else border
         found = advance(self.curve, course, guess, border, np.zeros(()), guess, np.asarray(True))
@@ -205,7 +205,7 @@ class OrbitTracer:
         length = min(self.max_step / speed, length * float(np.clip(TURN / max(turn, 1e-9), 0.5, 2)))
         return dataclasses.replace(arc, ahead=(*zeros, step), length=length, steps=steps)
 
-    def passes(self, begin: Spot, spot: Spot, step: Spot) -> bool:
+    def passes(self, begin: OrbitPoint, spot: OrbitPoint, step: OrbitPoint) -> bool:
         """Whether another orbit lies on the curve between two points."""
         value, upwards = begin.parameter, step.parameter > spot.parameter
         if not min(spot.parameter, step.parameter) <= value < max(spot.parameter, step.parameter):
@@ -215,7 +215,7 @@ class OrbitTracer:
         here = self.between(spot, step, value)
         return here is not None and alike(here, begin, self.curve, SAME)
 
-    def zeros(self, spot: Spot, step: Spot, length: float) -> list[Zero] | None:
+    def zeros(self, spot: OrbitPoint, step: OrbitPoint, length: float) -> list[Zero] | None:
         """The zeros of test functions between two points, in their order, up to the first at which the course ends;
         None if the step must be shorter for them to be told."""
         scale = float(spot.look.branch[1])
@@ -277,13 +277,13 @@ class OrbitTracer:
             out = [z for z in out[:-1] if out[-1].s - z.s > near] + out[-1:]
         return out
 
-    def short_of(self, spot: Spot, zero: Zero, off: float) -> tuple[float, Spot]:
+    def short_of(self, spot: OrbitPoint, zero: Zero, off: float) -> tuple[float, OrbitPoint]:
         """The point so far before a zero on the way from another point; if there is none, the zero."""
         s = zero.s - off
         here = None if s <= 0 else self.at(spot, s, spot.look.u + s / zero.s * (zero.spot.look.u - spot.look.u))
         return (zero.s, zero.spot) if here is None else (s, here)
 
-    def told(self, before: Spot, zero: Zero, together: list[Zero]) -> Zero:
+    def told(self, before: OrbitPoint, zero: Zero, together: list[Zero]) -> Zero:
         """What vanishes at one point, by the first of `CORNERS`."""
         rank = {kind: i for i, kind in enumerate((*CORNERS, "branch", "low", "high"))}
         several = sorted([zero, *together], key=lambda z: rank.get(z.test.kind, 99))
@@ -293,18 +293,18 @@ class OrbitTracer:
         side = int(np.sign(off if off else -before.look.tangent[-1]))
         return first._replace(others=others, side=side)
 
-    def value(self, spot: Spot, test: Test, scale: float) -> float:
+    def value(self, spot: OrbitPoint, test: Test, scale: float) -> float:
         found = told_by(self.curve, spot, scale).get(test)
         if found is None:
             raise ArithmeticError(f"{test} is not a number")
         return found
 
-    def located(self, spot: Spot, step: Spot, length: float, test: Test, scale: float) -> Zero | None:
+    def located(self, spot: OrbitPoint, step: OrbitPoint, length: float, test: Test, scale: float) -> Zero | None:
         """By bracketing: the curve is smooth there, and so is the test function but for the least value of a guard."""
-        seen: dict[float, Spot] = {0.0: spot, length: step}
+        seen: dict[float, OrbitPoint] = {0.0: spot, length: step}
         chord = step.look.u - spot.look.u
 
-        def at(s: float) -> Spot | None:
+        def at(s: float) -> OrbitPoint | None:
             return self.at(spot, s, spot.look.u + s / length * chord)
 
         s, rough = None, test.kind == "guard"
@@ -323,8 +323,8 @@ class OrbitTracer:
         return Zero(s, test, seen[s])
 
     def interpolated(
-        self, spot: Spot, s: float, length: float, chord: Any, scale: float, test: Test
-    ) -> tuple[float, Spot] | None:
+        self, spot: OrbitPoint, s: float, length: float, chord: Any, scale: float, test: Test
+    ) -> tuple[float, OrbitPoint] | None:
         """A point at which the equations are singular, by polynomials through points beside it."""
         nodes, spots = [], []
         for share in (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0):
@@ -348,19 +348,19 @@ class OrbitTracer:
         return s + 0.5 * length * root, spot_of(self.curve, found, spot.course)
 
 
-def alike(a: Spot, b: Spot, curve: OrbitCurve, tolerance: float) -> bool:
+def alike(a: OrbitPoint, b: OrbitPoint, curve: OrbitCurve, tolerance: float) -> bool:
     """Whether two orbits of one parameter are the same, or one of them the other several times."""
     sizes = np.asarray(curve.sizes)
     pairs = ((a.look.mean, b.look.mean, sizes), (a.look.square, b.look.square, sizes**2))
     return all(float(np.max(np.abs(x - y) / size)) < tolerance for x, y, size in pairs)
 
 
-def turned(spot: Spot) -> Spot:
+def turned(spot: OrbitPoint) -> OrbitPoint:
     look = spot.look
     branch = look.branch * np.array([-1, 1])  # the sign of a determinant of which the tangent is a row
     return dataclasses.replace(spot, look=look._replace(tangent=-look.tangent, branch=branch))
 
 
-def _complex_pair(spot: Spot) -> bool:
+def _complex_pair(spot: OrbitPoint) -> bool:
     on = np.abs(np.abs(spot.multipliers) - 1) < 1e-5
     return bool(np.any(on & (np.abs(np.imag(spot.multipliers)) > 1e-6)))

@@ -8,14 +8,14 @@ from jaxtyping import Array, Bool, Float
 from ..._numerics._autodiff import frozen
 from ..._numerics._linalg import linear_solve, parallel
 from ..._types import Scalar, Y
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 
 
 Pairs = dict[tuple[int, int], tuple[Bool[Array, ""], Float[Array, ""]]]
-"""Of two positions in `Model.holdable`: whether their surfaces coincide, and the sign of the ratio of their h."""
+"""Of two positions in `SwitchedSystem.holdable`: whether surfaces coincide, and the sign of the ratio of their h."""
 
 
-def reach(model: Model, matrix: Float[Array, "m m"]) -> Float[Array, " m"]:
+def reach(model: SwitchedSystem, matrix: Float[Array, "m m"]) -> Float[Array, " m"]:
     """How much the values of all `sgn` switches together may change dh/dt of each surface."""
     return jnp.sum(jnp.where(np.array([k not in model.contacts for k in model.holdable]), jnp.abs(matrix), 0), axis=1)
 
@@ -25,9 +25,9 @@ def negligible(rate: Scalar, span: Scalar) -> Bool[Array, ""]:
     return jnp.abs(rate) <= float(jnp.finfo(rate.dtype).eps) ** 0.5 * span
 
 
-def coinciding(model: Model, rates: Float[Array, " m"], matrix: Float[Array, "m m"]) -> Pairs:
+def coinciding(model: SwitchedSystem, rates: Float[Array, " m"], matrix: Float[Array, "m m"]) -> Pairs:
     """Which surfaces are one: at any values of the switches their h change in proportion. `rates` and `matrix` are
-    `Model.linear` at some of these values."""
+    `SwitchedSystem.linear` at some of these values."""
     size = reach(model, matrix)
     out = {}
     for i, j in model.pairs:
@@ -78,7 +78,7 @@ def _inverse(whole: Float[Array, "m m"], first: Bool[Array, " m"]) -> tuple[Floa
     return inverse, jnp.where(both, inverse, 0)
 
 
-def escapes(model: Model, t: Scalar, y: Y, state: State) -> Bool[Array, ""]:
+def escapes(model: SwitchedSystem, t: Scalar, y: Y, state: ModeState) -> Bool[Array, ""]:
     """Whether a solution that slides may leave at any time: a surface repels, and what else holds can go on doing so
     when it is let go to one of its sides. So it is beyond a two-fold, where the fields on both sides have become
     tangent to the surface (n · f⁺ = n · f⁻ = 0), as M_kk changes its sign there."""

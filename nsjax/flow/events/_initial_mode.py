@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool
 from ..._numerics._autodiff import frozen
 from ..._numerics._linalg import nearly
 from ..._types import Scalar, Y
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 from ...system._system import impact, relay, sgn
 from .._results import RESULTS
 from ._mode_choice import settle
@@ -18,8 +18,8 @@ AT_ONCE = 0.01  # times the root of eps and of the time to be solved for: what i
 
 
 def start_mode(
-    model: Model, t: Scalar, y: Y, given: dict[str, Any], horizon: Scalar
-) -> tuple[State, Bool[Array, ""], RESULTS]:
+    model: SwitchedSystem, t: Scalar, y: Y, given: dict[str, Any], horizon: Scalar
+) -> tuple[ModeState, Bool[Array, ""], RESULTS]:
     """The mode in which the solution sets out: from the signs of h, from `mode=`, and on a surface by the fields; and
     whether another solution sets out there too. `horizon`: for how long it is to be solved."""
     modes, parts, roots, at, chosen = [], [], [], {}, []
@@ -63,7 +63,7 @@ def start_mode(
                 beyond[k] = -h - 1e6 * noise
                 on[k] = h <= noise
             if switch.name not in given and k in model.contacts:
-                still = State((), tuple(parts), ())
+                still = ModeState((), tuple(parts), ())
                 (slow,) = model.rounding(lambda t, y, k=k, still=still: (model.level(k, t, y, still),), t, y)
                 at[k] = rests = on[k] & (jnp.abs(model.level(k, t, y, still)) <= slow)
             modes.append(rests.astype(jnp.int32))
@@ -77,7 +77,7 @@ def start_mode(
         else:
             modes.append(jnp.where(on[k], 0, jnp.sign(h)).astype(jnp.int32))
             at[k] = on[k]
-    state = State(tuple(modes), tuple(parts), tuple(roots))
+    state = ModeState(tuple(modes), tuple(parts), tuple(roots))
     for k, switch in enumerate(model.switches):
         if isinstance(switch, sgn) and switch.name not in given:
             # Nearer than an event can be told from the start: the end of a period on a surface is off by rounding.

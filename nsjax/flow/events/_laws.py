@@ -8,14 +8,14 @@ from jaxtyping import Array, Bool, Int
 
 from ..._numerics._linalg import nearly
 from ..._types import Scalar, Y
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 from ._attraction import attraction, negligible, Pairs, reach
 
 
 TRIED = 4  # up to this many switches at their surfaces, every assignment is tried
 
 
-class Look(NamedTuple):
+class Outcome(NamedTuple):
     """What an assignment leads to, for each switch that may be at its surface."""
 
     s: dict[int, Scalar]  # its value: a sign, or the multiplier λ
@@ -27,10 +27,10 @@ class Look(NamedTuple):
 class Instant(NamedTuple):
     """Where switches are at their surfaces, and what is known of each of them: see `settle`."""
 
-    model: Model
+    model: SwitchedSystem
     t: Scalar
     y: Y
-    state: State
+    state: ModeState
     at: dict[int, Bool[Array, ""]]
     leaves: dict[int, Int[Array, ""]]
     given: tuple[int, ...] | None
@@ -72,11 +72,11 @@ class Instant(NamedTuple):
         """Whether it comes to its surface only now."""
         return True if self.starts else self.came[k] != 0
 
-    def values(self, mode: dict[int, Any]) -> tuple[State, tuple]:
+    def values(self, mode: dict[int, Any]) -> tuple[ModeState, tuple]:
         trial = self.state._replace(mode=tuple(mode.values()))
         return trial, self.model.values(self.t, self.y, trial)
 
-    def look(self, mode: dict[int, Any]) -> Look:
+    def look(self, mode: dict[int, Any]) -> Outcome:
         model, t, y, which = self.model, self.t, self.y, self.which
         trial, s = self.values(mode)
         rates = dict(zip(which, model.rates(which, t, y, trial, s)))
@@ -91,7 +91,7 @@ class Instant(NamedTuple):
             }
             if self.pairs:
                 spans = spans | dict(zip(model.holdable, reach(model, matrix)))
-        return Look({k: s[k] for k in which}, rates, slopes, spans)
+        return Outcome({k: s[k] for k in which}, rates, slopes, spans)
 
     def grips(self, k: int, multiplier: Scalar) -> Bool[Array, ""]:
         """Whether, running backwards, static friction holds what arrives. It does not where |λ| < 1: there nothing
@@ -121,7 +121,7 @@ class Verdict(NamedTuple):
     sound: Bool[Array, ""]  # whether all laws are
     clear: Bool[Array, ""]  # and not just so: what leaves its surface does so with dh/dt beyond rounding
     rank: Int[Array, ""]
-    seen: Look
+    seen: Outcome
 
 
 def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Verdict:

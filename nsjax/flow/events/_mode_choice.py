@@ -13,20 +13,20 @@ from jaxtyping import Array, Bool, Int
 from ..._numerics._autodiff import frozen
 from ..._numerics._linalg import nearly
 from ..._types import Scalar, Y
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 from ._attraction import coinciding, reach
-from ._laws import Instant, judge, Look, TRIED
+from ._laws import Instant, judge, Outcome, TRIED
 
 
 def settle(
-    model: Model,
+    model: SwitchedSystem,
     t: Scalar,
     y: Y,
-    state: State,
+    state: ModeState,
     at: dict[int, Bool[Array, ""]],
     leaves: dict[int, Int[Array, ""]],
     given: tuple[int, ...] | None = None,
-) -> tuple[State, Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+) -> tuple[ModeState, Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
     """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}, every contact one from {1, 0}.
 
     An assignment is valid if each that holds has |λ| <= b (a contact a force λ >= 0) and each other one moves to its
@@ -148,7 +148,7 @@ def _together(here: Instant, trial: dict[int, Any]) -> Instant:
 
 
 def _elsewhere(
-    here: Instant, chosen: Int[Array, " m"], seen: Look, table: Int[Array, "rows m"], clear: Bool[Array, " rows"]
+    here: Instant, chosen: Int[Array, " m"], seen: Outcome, table: Int[Array, "rows m"], clear: Bool[Array, " rows"]
 ) -> Bool[Array, " m"]:
     """Which switches have another mode in one of the assignments of a table that are `clear`. Static friction that
     holds goes on doing so, as its law says: that it might let go is no other solution."""
@@ -177,7 +177,7 @@ def _assignments(here: Instant) -> tuple[Int[Array, "rows m"], Bool[Array, " row
     return jnp.asarray([(*o, 0)[:3] for o in options], jnp.int32)[np.arange(len(which)), code], real
 
 
-def _best(here: Instant, trial: dict, noise: dict) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
+def _best(here: Instant, trial: dict, noise: dict) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
     """The assignment to be preferred, of all that are valid; what it leads to; of each switch whether another solution
     gives it another mode; and whether the choice is open."""
     which = here.which
@@ -191,7 +191,7 @@ def _best(here: Instant, trial: dict, noise: dict) -> tuple[dict, Look, Bool[Arr
     return trial | out, seen, others, jnp.sum(score == score[best]) != 1
 
 
-def _guess(here: Instant, trial: dict, seen: Look) -> dict:
+def _guess(here: Instant, trial: dict, seen: Outcome) -> dict:
     """What is held as a first guess: all but what leaves, what repels, and what cannot be held."""
     model, at, came, leaves, out = here.model, here.at, here.came, here.leaves, dict(trial)
     for k in here.which:
@@ -210,7 +210,7 @@ def _guess(here: Instant, trial: dict, seen: Look) -> dict:
     return out
 
 
-def _alone(here: Instant, trial: dict, noise: dict) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
+def _alone(here: Instant, trial: dict, noise: dict) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
     """The same as `_best` for one switch, which has no choice."""
     ((k, at),) = here.at.items()
     seen = here.look(trial)
@@ -230,7 +230,7 @@ def _either(multiplier: Scalar, bound: Any, slope: Scalar) -> Bool[Array, ""]:
     return (size <= bound) & ((slope > 0) | (size > 1 + nearly(size)))
 
 
-def _search(here: Instant, trial: dict, noise: dict) -> tuple[dict, Look, Bool[Array, " m"], Bool[Array, ""]]:
+def _search(here: Instant, trial: dict, noise: dict) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
     """The same where too many are at their surfaces to try every assignment."""
     which, came, seen = here.which, here.came, here.look(trial)
     trial = _guess(here, trial, seen)
@@ -296,7 +296,7 @@ def _pinned(here: Instant, trial: dict, rates: dict) -> dict:
     return out
 
 
-def _amend(here: Instant, trial: dict, seen: Look, noise: dict) -> tuple[dict, Bool[Array, ""]]:
+def _amend(here: Instant, trial: dict, seen: Outcome, noise: dict) -> tuple[dict, Bool[Array, ""]]:
     """One release, or one taking back, of the switch that violates its law most."""
     model, which = here.model, here.which
     s, rates, slopes, _ = seen

@@ -16,7 +16,7 @@ from ..._numerics._bernstein import at, bend, deflate, falls, first_root, larges
 from ..._numerics._jaxpr import is_constant
 from ..._numerics._linalg import linear_solve
 from ..._types import Scalar, Y
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 from ...system._system import clock, impact, relay, sgn
 from .._results import RESULTS
 from ..steppers._stepper import stack, Stepper
@@ -32,7 +32,7 @@ class Landing(NamedTuple):
     y_before: Y
     y_after: Y
     f_after: Y
-    state: State
+    state: ModeState
     slot: Int[Array, ""]
     news: Bool[Array, ""]  # whether anything changed, so that it belongs into the log
     points: Y | None  # control points of the step to the event, if asked for
@@ -81,13 +81,13 @@ def _arrival_jvp(primals: Any, tangents: Any) -> tuple[tuple[Scalar, Y], tuple[S
 
 
 def locate(
-    model: Model,
+    model: SwitchedSystem,
     stepper: Stepper,
     t: Scalar,
     t_next: Scalar,
     y: Y,
     f0: Y,
-    state: State,
+    state: ModeState,
     polynomials: list[Float[Array, "slots parts"]],
     noise: Float[Array, "slots parts"],
 ) -> tuple[Bool[Array, ""], Scalar, Y, Int[Array, ""], Int[Array, " slots"], Float[Array, " slots"]]:
@@ -162,7 +162,7 @@ def locate(
     return met, te, y_end, slot, part, missed
 
 
-def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> tuple[Y, Y]:
+def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> tuple[Y, Y]:
     """The state after an impact, by the user's reset or by Newton's law with the impulse along ∂f/∂s; and the size of
     the terms of which it is the sum: where they cancel, what is left is their rounding.
 
@@ -230,7 +230,7 @@ def rebound(model: Model, k: int, t: Scalar, y: Y, state: State) -> tuple[Y, Y]:
 
 
 def land(
-    model: Model,
+    model: SwitchedSystem,
     stepper: Stepper,
     tolerance: tuple[Any, Any],
     want_points: bool,
@@ -239,7 +239,7 @@ def land(
     t_next: Scalar,
     y: Y,
     f0: Y,
-    state: State,
+    state: ModeState,
     polynomials: list[Float[Array, "slots parts"]],
     noise: Float[Array, "slots parts"],
 ) -> Landing:
@@ -312,7 +312,7 @@ def land(
             slack = 1e4 * later.rounding(lambda t, y, k=k: later.h(k, t, y), te, after, size)
             result = RESULTS.where(ticks & jnp.any(gaps < -slack), RESULTS.jump_penetrates, result)
             modes[k] = jnp.where(ticks & jnp.all(gaps > slack), 0, modes[k])
-    state_after = State(tuple(m.astype(jnp.int32) for m in modes), tuple(parts), tuple(roots))
+    state_after = ModeState(tuple(m.astype(jnp.int32) for m in modes), tuple(parts), tuple(roots))
 
     t_after, jumped = te, after
     for k, switch in enumerate(model.switches):
@@ -344,7 +344,7 @@ def land(
         else:
             result = RESULTS.where(ends & (result == RESULTS.successful), RESULTS.accumulation_reached, result)
     at = {k: at[k] for k in sorted(at)}
-    state_after = State(tuple(m.astype(jnp.int32) for m in modes), tuple(parts), tuple(roots))
+    state_after = ModeState(tuple(m.astype(jnp.int32) for m in modes), tuple(parts), tuple(roots))
     # What cannot be held crosses when it fires, but for the residual of an event a few ulps earlier, which dh/dt tells.
     crosses = {k: fired[k] & ~(halted & (state.roots[k] == 0)) for k in fired}
     bounds = {k: b if k in model.holdable else crosses[k].astype(jnp.int32) for k, b in bounds.items()}
@@ -412,7 +412,7 @@ def land(
 
 
 def transversality(
-    model: Model, t: Scalar, y: Y, state: State, part: Int[Array, " slots"], tolerance: Any
+    model: SwitchedSystem, t: Scalar, y: Y, state: ModeState, part: Int[Array, " slots"], tolerance: Any
 ) -> tuple[Float[Array, " slots"], Float[Array, " slots"]]:
     """Of each guard the cosine between the trajectory and the normal of its surface, in time and state; and what an
     error of the state within the tolerance (relative, absolute) makes of it."""
@@ -434,7 +434,7 @@ def cosine(h_t: Scalar, n: Float[Array, " n"], f: Float[Array, " n"]) -> Scalar:
     return jnp.abs(n @ f + h_t) / jnp.sqrt(size)
 
 
-def slow(model: Model, k: int, t: Scalar, y: Y, state: State) -> Scalar:
+def slow(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
     """What rounding can make of dh/dt of switch k along the flow."""
     model, t, y = frozen((model, t, y))
     f = model.flow(t, y, state)
@@ -455,7 +455,9 @@ class Completed(NamedTuple):
     wrong: Bool[Array, ""]  # whether the reset leads to the forbidden side
 
 
-def completed(model: Model, k: int, te: Scalar, before: Y, after: Y, state: State, state_after: State) -> Completed:
+def completed(
+    model: SwitchedSystem, k: int, te: Scalar, before: Y, after: Y, state: ModeState, state_after: ModeState
+) -> Completed:
     """Checks an impact, and sums the sequence of ever shorter flights that follows it up to its accumulation point.
 
     With the velocity h' after the impact, the acceleration h'' < 0 and the ratio r = -h'(t+)/h'(t-) < 1 the remaining

@@ -19,7 +19,7 @@ from ..._numerics._jaxpr import is_affine, is_constant
 from ..._numerics._linalg import product
 from ..._numerics._series import Series
 from ..._types import Scalar, Y
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 from ._stepper import bernstein, jittered, stack, Step, Stepper, unresolved, Watch, with_multipliers
 
 
@@ -243,14 +243,21 @@ class ExponentialStepper(Stepper):
     slides: bool = eqx.field(static=True, default=True)  # whether the modes that hold are affine too
     degree: int = eqx.field(static=True, default=_N)
 
-    def made_for(self, model: Model, state: State, t: Scalar, y: Y) -> "ExponentialStepper":
+    def made_for(self, model: SwitchedSystem, state: ModeState, t: Scalar, y: Y) -> "ExponentialStepper":
         s = model.signs(t, state)
         _check_affine(lambda t, y: model.field(t, y, s), t, y, f"`{type(model.system).__name__}`")
         slides = all(affine_parts(lambda t, y: model.flow(t, y, state), t, y))
         return ExponentialStepper(self.solver, slides)
 
     def __call__(
-        self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watch | None = None
+        self,
+        model: SwitchedSystem,
+        state: ModeState,
+        t: Scalar,
+        t_next: Scalar,
+        y: Y,
+        f0: Y,
+        watch: Watch | None = None,
     ) -> Step:
         force = model.force(t, y, state) if self.slides and model.holdable else None
         ys, _, excess, fits = _sampled(lambda t, y: model.flow(t, y, state), t, t_next - t, y, f0, force)

@@ -23,7 +23,7 @@ from ..._numerics._barrier import once
 from ..._numerics._bernstein import binomials, nodes, to_bernstein, to_chebyshev
 from ..._numerics._lane_cond import compact_cond
 from ..._types import Scalar, Y
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 
 
 Field = Callable[[Scalar, Y], Y]
@@ -96,13 +96,20 @@ class Stepper(eqx.Module):
     solver: eqx.AbstractVar[dfx.AbstractSolver]
     degree: eqx.AbstractVar[int]
 
-    def made_for(self, model: Model, state: State, t: Scalar, y: Y) -> "Stepper":
+    def made_for(self, model: SwitchedSystem, state: ModeState, t: Scalar, y: Y) -> "Stepper":
         """The same for this model, or an error if the method cannot be used for it."""
         return self
 
     @abc.abstractmethod
     def __call__(
-        self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watch | None = None
+        self,
+        model: SwitchedSystem,
+        state: ModeState,
+        t: Scalar,
+        t_next: Scalar,
+        y: Y,
+        f0: Y,
+        watch: Watch | None = None,
     ) -> Step:
         """A step from `t`, where the field is `f0`, to `t_next`.
 
@@ -123,7 +130,7 @@ class Stepper(eqx.Module):
         """Value and slope of such a polynomial at the end of the step."""
         return c[-1], (len(c) - 1) * (c[-1] - c[-2])
 
-    def scaled(self, model: Model, guards: list[list[list[Scalar]]]) -> list[Float[Array, "slots parts"]]:
+    def scaled(self, model: SwitchedSystem, guards: list[list[list[Scalar]]]) -> list[Float[Array, "slots parts"]]:
         """The polynomials of the guards as `_crossing` wants them: coefficients in Σ a_j u^j (1 - u)^(n - j)."""
         n = max(len(c) for row in guards for c in row) - 1
 
@@ -167,14 +174,21 @@ class RungeKutta(Stepper):
         self.degree = _dense_weights(type(solver), self.stages, _double())[1]
 
     def __call__(
-        self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watch | None = None
+        self,
+        model: SwitchedSystem,
+        state: ModeState,
+        t: Scalar,
+        t_next: Scalar,
+        y: Y,
+        f0: Y,
+        watch: Watch | None = None,
     ) -> Step:
         step = self.step(model, state, t, t_next, y, f0)
         if watch is None or not model.slots:
             return step
         return step._replace(**self.watched(model, state, watch.affine, t, y, step))
 
-    def step(self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y) -> Step:
+    def step(self, model: SwitchedSystem, state: ModeState, t: Scalar, t_next: Scalar, y: Y, f0: Y) -> Step:
         def f(t: Scalar, y: Y) -> Y:
             return model.flow(t, y, state)
 
@@ -224,7 +238,7 @@ class RungeKutta(Stepper):
         return self._weighted(to_bernstein(self.degree) @ self._values(nodes(self.degree)), y, y1, ks)
 
     def watched(
-        self, model: Model, state: State, affine: tuple[bool, ...], t: Scalar, y: Y, step: Step
+        self, model: SwitchedSystem, state: ModeState, affine: tuple[bool, ...], t: Scalar, y: Y, step: Step
     ) -> dict[str, Any]:
         """Bernstein coefficients `[slot][part][j]` of the guards along a step, and what belongs to them."""
         model, state, t, y, step = frozen((model, state, t, y, step))
@@ -242,7 +256,7 @@ class RungeKutta(Stepper):
             n = max(8, self.degree + 3)
             others = tuple(not each for each in affine)
 
-            def curved(model: Model, state: State, t: Scalar, y: Y, step: Step) -> list[list[Scalar]]:
+            def curved(model: SwitchedSystem, state: ModeState, t: Scalar, y: Y, step: Step) -> list[list[Scalar]]:
                 points = self._weighted(self._values(nodes(n)), y, step.y1, step.ks)
                 return [v for _, v in _sampled(model, state, t, step, [*map(float, nodes(n))], points, others)]
 
@@ -270,7 +284,13 @@ class RungeKutta(Stepper):
 
 
 def _sampled(
-    model: Model, state: State, t: Scalar, step: Step, at: list[float], points: list[Y], wanted: tuple[bool, ...]
+    model: SwitchedSystem,
+    state: ModeState,
+    t: Scalar,
+    step: Step,
+    at: list[float],
+    points: list[Y],
+    wanted: tuple[bool, ...],
 ) -> list[tuple[int, list[Scalar]]]:
     """(slot, values along the step) for every part of the guards that are wanted."""
     dt = step.t_next - t
@@ -288,7 +308,7 @@ def unresolved(dtype: Any) -> float:
     return max(1e-7, 64 * float(jnp.finfo(dtype).eps))
 
 
-def jittered(model: Model, state: State, t: Scalar, y: Y) -> list[list[Scalar]]:
+def jittered(model: SwitchedSystem, state: ModeState, t: Scalar, y: Y) -> list[list[Scalar]]:
     """The guards with the last digits of time and state changed, each up or down: what differs is rounding."""
     flat, unravel = jfu.ravel_pytree(frozen(y))
     size = 64 * float(jnp.finfo(t.dtype).eps)
@@ -296,7 +316,7 @@ def jittered(model: Model, state: State, t: Scalar, y: Y) -> list[list[Scalar]]:
     return model.guards(frozen(t) * (1 + size), unravel(flat * jnp.asarray(1 + size * signs, flat.dtype)), state)
 
 
-def with_multipliers(model: Model, noise: list[list[Scalar]]) -> list[list[Scalar]]:
+def with_multipliers(model: SwitchedSystem, noise: list[list[Scalar]]) -> list[list[Scalar]]:
     """The rounding of the guards, with that of the digits λ itself is computed with."""
     own = [slot.holding and slot.switch not in model.contacts for slot in model.slots]
     return [[x + 64 * jnp.finfo(x.dtype).eps if o else x for x in row] for row, o in zip(noise, own)]

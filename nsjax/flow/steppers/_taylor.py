@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from ..._numerics._bernstein import binomials
 from ..._numerics._series import Coefficient, Series
 from ..._types import Scalar, Y
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 from ._stepper import jittered, Step, Stepper, unresolved, Watch, with_multipliers
 
 
@@ -168,7 +168,14 @@ class TaylorStepper(Stepper):
         self.degree = solver.terms
 
     def __call__(
-        self, model: Model, state: State, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watch | None = None
+        self,
+        model: SwitchedSystem,
+        state: ModeState,
+        t: Scalar,
+        t_next: Scalar,
+        y: Y,
+        f0: Y,
+        watch: Watch | None = None,
     ) -> Step:
         leaves, tree = jax.tree.flatten(y)
         which = model.holdable
@@ -219,7 +226,7 @@ class TaylorStepper(Stepper):
         return Step(t_next, y1, _error(ks, last), ks, slope, guards, with_multipliers(model, noise), resolved)
 
     def guard_series(
-        self, model: Model, state: State, t: Scalar, tree: Any, ys: list[list[Any]], sigma: list[list[Any]]
+        self, model: SwitchedSystem, state: ModeState, t: Scalar, tree: Any, ys: list[list[Any]], sigma: list[list[Any]]
     ) -> list[list[list[Scalar]]]:
         """Taylor coefficients `[slot][part][j]` of the guards."""
 
@@ -237,7 +244,7 @@ class TaylorStepper(Stepper):
             for row in jax.eval_shape(fn, t, *first)
         ]
 
-    def values(self, model: Model, state: State, t: Scalar, multipliers: Any) -> tuple[Any, ...]:
+    def values(self, model: SwitchedSystem, state: ModeState, t: Scalar, multipliers: Any) -> tuple[Any, ...]:
         """Switch values of a mode, where the multipliers are known."""
         s = list(model.signs(t, state))
         for k, multiplier in zip(model.holdable, multipliers, strict=True):
@@ -265,7 +272,7 @@ class TaylorStepper(Stepper):
     def end(self, c: list[Scalar]) -> tuple[Scalar, Scalar]:
         return sum(c[-2::-1], c[-1]), sum((j * x for j, x in reversed([*enumerate(c)])), jnp.zeros_like(c[0]))
 
-    def scaled(self, model: Model, guards: list[list[list[Scalar]]]) -> list[Float[Array, "slots parts"]]:
+    def scaled(self, model: SwitchedSystem, guards: list[list[list[Scalar]]]) -> list[Float[Array, "slots parts"]]:
         powers = model.stacked([[jnp.stack(c) for c in row] for row in guards], -1.0)
         matrix = _from_powers(self.degree) * np.array(binomials(self.degree))[:, None]
         return list(jnp.tensordot(jnp.asarray(matrix, powers.dtype), powers, axes=(1, 2)))

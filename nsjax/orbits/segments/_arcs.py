@@ -18,7 +18,7 @@ from ..._types import Scalar, Y
 from ...derivatives._saltation import states
 from ...flow._results import is_okay
 from ...flow._solve import solve
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 from ...system._system import System
 
 
@@ -65,32 +65,32 @@ class Path(NamedTuple):
 class Smooth(System):
     """The field of one mode."""
 
-    model: Model
-    state: State
+    model: SwitchedSystem
+    state: ModeState
 
     def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
         return self.model.flow(t, y, self.state)
 
 
-def model_of(system: System, t: Scalar, y: Y) -> Model:
-    return Model(system, jnp.ones_like(t), t, y)
+def model_of(system: System, t: Scalar, y: Y) -> SwitchedSystem:
+    return SwitchedSystem(system, jnp.ones_like(t), t, y)
 
 
 class Flows(eqx.Module):
     """The smooth flows of all arcs of a system, each divided into `pieces` of equal length."""
 
     system: System
-    within: State
+    within: ModeState
     t0: Scalar
     y0: Y
     pieces: int = eqx.field(static=True)
     how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
 
     @property
-    def model(self) -> Model:
+    def model(self) -> SwitchedSystem:
         return model_of(self.system, self.t0, self.y0)
 
-    def piece(self, a: Scalar, b: Scalar, x: Array, state: State, saveat: dfx.SaveAt) -> Any:
+    def piece(self, a: Scalar, b: Scalar, x: Array, state: ModeState, saveat: dfx.SaveAt) -> Any:
         unravel = jfu.ravel_pytree(self.y0)[1]
         smooth = Smooth(self.model, state)
         sol = solve(smooth, a, b, unravel(x), saveat=saveat, throw=False, **dict(self.how))
@@ -100,14 +100,14 @@ class Flows(eqx.Module):
     def rows(self, fn: Any, begin: Array, end: Array, x: Array) -> Any:
         """`fn(a, b, x, state)` for every piece of every arc."""
 
-        def row(a: Scalar, b: Scalar, x: Array, state: State) -> Any:
+        def row(a: Scalar, b: Scalar, x: Array, state: ModeState) -> Any:
             starts = a + (b - a) * jnp.arange(self.pieces, dtype=a.dtype) / self.pieces
             return jax.vmap(lambda a, b, x: fn(a, b, x, state))(starts, jnp.append(starts[1:], b), x)
 
         return jax.vmap(row)(begin, end, x, self.within)
 
     def ends(self, begin: Array, end: Array, x: Array) -> Float[Array, "rows pieces n"]:
-        def last(flows: Flows, a: Scalar, b: Scalar, x: Array, state: State) -> Array:
+        def last(flows: Flows, a: Scalar, b: Scalar, x: Array, state: ModeState) -> Array:
             return flows.piece(a, b, x, state, dfx.SaveAt(t1=True))[0]
 
         return self.rows(lambda *args: dense_jacobian(last, self, *args), begin, end, x)
@@ -115,7 +115,7 @@ class Flows(eqx.Module):
     def paths(self, begin: Array, end: Array, x: Array, samples: int = SAMPLES) -> tuple[Array, Array]:
         """Times and states along every arc."""
 
-        def along(a: Scalar, b: Scalar, x: Array, state: State) -> tuple[Array, Array]:
+        def along(a: Scalar, b: Scalar, x: Array, state: ModeState) -> tuple[Array, Array]:
             ts = jnp.linspace(a, b, samples)
             return ts, self.piece(a, b, x, state, dfx.SaveAt(ts=ts))
 
@@ -123,8 +123,8 @@ class Flows(eqx.Module):
         return ts.reshape(len(begin), -1), xs.reshape(len(begin), -1, x.shape[-1])
 
     def minima(
-        self, a: Scalar, b: Scalar, x: Array, state: State, functions: Callable[[Scalar, Array], list[list[Scalar]]],
-        below: Callable[[Array], Array],
+        self, a: Scalar, b: Scalar, x: Array, state: ModeState,
+        functions: Callable[[Scalar, Array], list[list[Scalar]]], below: Callable[[Array], Array],
     ) -> Minima:  # fmt: skip
         """The least values along a piece of functions `[function][part]` of time and state, each the largest of its
         parts (`below` as for `minima`)."""
@@ -153,7 +153,7 @@ class Flows(eqx.Module):
     def derivatives(self, begin: Array, end: Array, x: Array) -> tuple[Array, Float[Array, "rows pieces n n"]]:
         """The ends of all pieces, and their derivatives by the beginnings."""
 
-        def one(a: Scalar, b: Scalar, x: Array, state: State) -> tuple[Array, Array]:
+        def one(a: Scalar, b: Scalar, x: Array, state: ModeState) -> tuple[Array, Array]:
             def last(x: Array) -> tuple[Array, Array]:
                 (end,) = self.piece(a, b, x, state, dfx.SaveAt(t1=True))
                 return end, end

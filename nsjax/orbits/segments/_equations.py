@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._types import Scalar, Y
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 from ...system._parameter import Path
 from ...system._system import impact, relay
 from ._guess import landing
-from ._itinerary import Course, EVENT, FREE, LEAST, Start, TIME
+from ._itinerary import Course, EVENT, GRAZING, REPELLING_EXIT, Start, TIME
 from ._segment_flow import ALWAYS, FREE_MODES, SegmentFlow, with_parameter
 
 
@@ -34,7 +34,7 @@ class OrbitCurve(eqx.Module):
     With several parameters (`path` holds their paths, and `low` and `width` are vectors) their orbits are a surface.
     """
 
-    model: Model
+    model: SwitchedSystem
     path: Path = eqx.field(static=True)
     like: Y
     low: Float[Array, "*parameters"]
@@ -88,26 +88,26 @@ class OrbitCurve(eqx.Module):
         z /= np.array([float(self.time)] * 2 + np.asarray(self.sizes).tolist())
         return np.append(z.ravel(), (np.asarray(value) - self.low) / self.width)
 
-    def state(self, mode: Array, part: Array) -> State:
+    def state(self, mode: Array, part: Array) -> ModeState:
         model = self.model
         several = [n > 1 and not isinstance(k, relay) for n, k in zip(model.parts, model.switches)]
         parts = tuple(p if on else None for p, on in zip(part, several))
-        return State(tuple(mode), parts, tuple(jnp.zeros((), jnp.int32) for _ in model.switches))
+        return ModeState(tuple(mode), parts, tuple(jnp.zeros((), jnp.int32) for _ in model.switches))
 
-    def guard_rows(self, model: Model, t: Scalar, x: Array, state: State) -> list[list[Scalar]]:
+    def guard_rows(self, model: SwitchedSystem, t: Scalar, x: Array, state: ModeState) -> list[list[Scalar]]:
         """`[slot][part]`; those that no segment asks for are 1."""
         wanted = tuple(self.slides or not slot.holding for slot in model.slots)
         return [row or [jnp.ones_like(t)] for row in model.guards(t, self.unravel(x), state, wanted)]
 
-    def guards(self, model: Model, t: Scalar, x: Array, state: State) -> Float[Array, "slots parts"]:
+    def guards(self, model: SwitchedSystem, t: Scalar, x: Array, state: ModeState) -> Float[Array, "slots parts"]:
         return model.stacked(self.guard_rows(model, t, x, state), -jnp.inf)
 
-    def guard(self, model: Model, t: Scalar, x: Array, state: State, slot: Array, entry: Array) -> Scalar:
+    def guard(self, model: SwitchedSystem, t: Scalar, x: Array, state: ModeState, slot: Array, entry: Array) -> Scalar:
         if not model.slots:
             return jnp.ones_like(t)
         return self.guards(model, t, x, state)[slot, entry]
 
-    def rate(self, model: Model, t: Scalar, x: Array, state: State, slot: Array, entry: Array) -> Scalar:
+    def rate(self, model: SwitchedSystem, t: Scalar, x: Array, state: ModeState, slot: Array, entry: Array) -> Scalar:
         """How fast a guard changes along the flow."""
         f = jfu.ravel_pytree(model.flow(t, self.unravel(x), state))[0]
         along = jax.jvp(lambda t, x: self.guard(model, t, x, state, slot, entry), (t, x), (jnp.ones_like(t), f))
@@ -150,14 +150,14 @@ class OrbitCurve(eqx.Module):
             slot, entry, ends = what
             state = self.state(mode, part)
             out = self.guard(model, b, last, state, slot, entry)
-            out = jnp.where(ends == LEAST, self.rate(model, b, last, state, slot, entry) * self.time, out)
+            out = jnp.where(ends == GRAZING, self.rate(model, b, last, state, slot, entry) * self.time, out)
             if model.holdable and model.slots:
                 holding = self.guard(model, a, x, state, slot, entry) + 1
                 for k in model.holdable:
                     if k not in model.contacts:
                         here = jnp.asarray([s.switch == k for s in model.slots])[slot]
                         holding = jnp.where(here, holding - model.bound(k), holding)
-                out = jnp.where(ends == FREE, holding, out)
+                out = jnp.where(ends == REPELLING_EXIT, holding, out)
             out = out / (jnp.asarray(self.guard_sizes)[slot] if model.slots else 1)
             closing = self.normal @ (x - self.reference) if forced is None else b - a - forced
             return jnp.where(ends == TIME, closing, out)
@@ -198,8 +198,8 @@ def row_sizes(df: Array) -> Array:
 
 @eqx.filter_jit
 def state_at(curve: OrbitCurve, value: Array, a: Scalar, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
-    """The state at a time in a segment. (Between steps the states of a `Look` are those of the solver's dense output,
-    less exact than the steps.)"""
+    """The state at a time in a segment. (Between steps the states of a `PointData` are those of the solver's dense
+    output, less exact than the steps.)"""
     return curve.flow.arrive(a, t, x, value, curve.state(mode, part))
 
 

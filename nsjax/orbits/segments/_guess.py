@@ -16,7 +16,7 @@ from ...derivatives._variational import arcs
 from ...flow._results import is_okay
 from ...flow._solution import Solution
 from ...flow._solve import solve
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 from ...system._system import System
 from .._guess import base_point
 from ._arcs import model_of, Smooth
@@ -40,19 +40,19 @@ class Segment(NamedTuple):
     free: bool = False
 
 
-class Cuts(NamedTuple):
+class SegmentGuess(NamedTuple):
     """What is given of an orbit: the rows are its segments. Those beyond the last are there to fill up."""
 
     begin: Float[Array, " rows"]  # guesses
     end: Float[Array, " rows"]
     y: Y  # at the beginnings
-    within: State  # the mode, and the components of h that are active, at the beginnings
-    ending: State  # the same at the ends
+    within: ModeState  # the mode, and the components of h that are active, at the beginnings
+    ending: ModeState  # the same at the ends
     switch: Int[Array, " rows"]  # whose event ends it
     num: Int[Array, ""]  # the row of the last segment, which ends where the first begins
     free: tuple[bool, ...]
 
-    def first(self, rows: int) -> "Cuts":
+    def first(self, rows: int) -> "SegmentGuess":
         cut = jax.tree.map(lambda x: x[:rows], self._replace(num=(), free=()))
         return cut._replace(num=self.num, free=self.free[:rows])
 
@@ -62,7 +62,7 @@ def where(rows: Array, a: Any, b: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(rows.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), a, b)
 
 
-def cuts_of(system: System, sol: Solution, t0: Scalar, y0: Y) -> Cuts:
+def cuts_of(system: System, sol: Solution, t0: Scalar, y0: Y) -> SegmentGuess:
     """The segments of a solution, up to where it was last in the mode in which it begins."""
     begin, end, y, modes = arcs(sol, t0, y0)
     model = model_of(system, t0, y0)
@@ -81,15 +81,15 @@ def cuts_of(system: System, sol: Solution, t0: Scalar, y0: Y) -> Cuts:
 
     begin, end, y, modes, last = fill(begin, end), fill(end, end), fill(y, last), fill(modes, modes), fill(last, last)
 
-    def state(t: Scalar, y: Y, mode: Array) -> State:
+    def state(t: Scalar, y: Y, mode: Array) -> ModeState:
         return states(model, t, y, tuple(mode))
 
     switch = jnp.append(events.switch, jnp.asarray(-1, events.switch.dtype))
     within, ending = jax.vmap(state)(begin, y, modes), jax.vmap(state)(end, last, modes)
-    return Cuts(begin, end, y, within, ending, jnp.where(index < num, switch, -1), num, (False,) * len(begin))
+    return SegmentGuess(begin, end, y, within, ending, jnp.where(index < num, switch, -1), num, (False,) * len(begin))
 
 
-def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, how: dict) -> Cuts:
+def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, how: dict) -> SegmentGuess:
     """The segments that a user wrote down, each followed in its mode for as long as was said."""
     names = [k.name for k in system.switches]
     modes = [_mode(names, s.mode) for s in segments]
@@ -130,7 +130,7 @@ def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, ho
 
     rows = (mode, jnp.roll(mode, -1, axis=0), switch, durations)
     _, (begin, end, y, within, ending) = lax.scan(follow, (t0, y0), rows)
-    return Cuts(
+    return SegmentGuess(
         begin,
         end,
         y,
@@ -156,7 +156,7 @@ def _mode(names: list[str], mode: Any) -> tuple[int, ...]:
 @eqx.filter_jit
 def cuts_near(
     system: System, t0: Scalar, y0: Y, period: Scalar, order: int, mode: Any, how: dict
-) -> tuple[Cuts, Bool[Array, ""]]:
+) -> tuple[SegmentGuess, Bool[Array, ""]]:
     """The segments of the solution from a guess, and whether it came back to the mode in which it begins."""
     if system.period is None:
         y0, period, mode = base_point(system, t0, y0, period, 1.0, mode, how)
@@ -167,7 +167,7 @@ def cuts_near(
     return cuts, is_okay(sol.result) & ((cuts.num > 0) | (sol.events.num == 0))
 
 
-def landing(model: Model, k: Array, t: Scalar, y: Y, ending: State, after: tuple) -> tuple[Y, Scalar]:
+def landing(model: SwitchedSystem, k: Array, t: Scalar, y: Y, ending: ModeState, after: tuple) -> tuple[Y, Scalar]:
     """The state after the event of switch k (-1: none), and the time up to the state of rest."""
     out = (y, jnp.zeros_like(t))
     for i in range(len(model.switches)):

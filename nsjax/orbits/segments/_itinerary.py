@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from ..._types import Scalar, Y
 from ...derivatives._saltation import states
 from ...flow._solution import Events
-from ...system._model import Model
+from ...system._model import SwitchedSystem
 from ...system._system import arrays_of, relay, sgn, System
 from .._orbit import Orbit
 
@@ -22,7 +22,7 @@ from .._orbit import Orbit
 # What ends a segment: a guard falls to zero; a period has passed (of an orbit without events); a guard is least there
 # (a cut that changes nothing, at which its value is watched); or nothing does: it slides on a surface that repels, onto
 # which it came tangentially (section 6.7).
-EVENT, TIME, LEAST, FREE = range(4)
+EVENT, TIME, GRAZING, REPELLING_EXIT = range(4)
 
 
 class Course(NamedTuple):
@@ -33,7 +33,7 @@ class Course(NamedTuple):
 
     mode: Int[np.ndarray, "rows switches"]
     part: Int[np.ndarray, "rows switches"]  # of a surface that holds the segment and has several components: which
-    ends: Int[np.ndarray, " rows"]  # EVENT, TIME, LEAST or FREE
+    ends: Int[np.ndarray, " rows"]  # EVENT, TIME, GRAZING or REPELLING_EXIT
     slot: Int[np.ndarray, " rows"]  # the guard that ends it
     entry: Int[np.ndarray, " rows"]  # and its component
     num: Int[np.ndarray, ""]
@@ -80,11 +80,11 @@ def capacity_for(segments: int) -> int:
     return next(c for c in (4, 8, 16, 32, 64, 128, 256, 512) if c >= segments)
 
 
-def slot_of(model: Model, k: int, holding: bool, part: int) -> int:
+def slot_of(model: SwitchedSystem, k: int, holding: bool, part: int) -> int:
     return next(i for i, s in enumerate(model.slots) if (s.switch, s.holding, s.part) == (k, holding, part))
 
 
-def event_slot(model: Model, k: int, mode: Any, part: int, multiplier: float) -> tuple[int, int]:
+def event_slot(model: SwitchedSystem, k: int, mode: Any, part: int, multiplier: float) -> tuple[int, int]:
     """The guard, and its component, at whose zero switch k has its event in `mode`: `part` is the component of h that
     is at zero, `multiplier` the value of the switch if it holds."""
     if k in model.holdable and model.held(k, mode):
@@ -94,7 +94,7 @@ def event_slot(model: Model, k: int, mode: Any, part: int, multiplier: float) ->
     return slot_of(model, k, False, 0 if isinstance(model.switches[k], relay) else part), 0
 
 
-class Diary(NamedTuple):
+class EventRecord(NamedTuple):
     """What happens to an orbit in one period: its events, with modes and states before and after each."""
 
     t: Float[np.ndarray, " events"]
@@ -103,7 +103,7 @@ class Diary(NamedTuple):
     states: tuple[Float[np.ndarray, "events n"], Float[np.ndarray, "events n"]]
 
     @classmethod
-    def of(cls, log: Events) -> "Diary":
+    def of(cls, log: Events) -> "EventRecord":
         n = int(log.num)
         modes, states = (log.mode_before, log.mode_after), (log.y_before, log.y_after)
         t, switch, modes, states = jax.tree.map(lambda x: np.asarray(x)[:n], (log.t, log.switch, modes, states))
@@ -113,17 +113,17 @@ class Diary(NamedTuple):
 
         return cls(t, switch, modes, (flat(states[0]), flat(states[1])))
 
-    def joined(self, other: "Diary") -> "Diary":
+    def joined(self, other: "EventRecord") -> "EventRecord":
         return jax.tree.map(lambda *rows: np.concatenate(rows), self, other)
 
 
 @eqx.filter_jit
-def _looked_at(model: Model, like: Y, systems: System, diaries: Diary) -> tuple[Array, Array, Array]:
+def _looked_at(model: SwitchedSystem, like: Y, systems: System, diaries: EventRecord) -> tuple[Array, Array, Array]:
     """At each event of each orbit the component of every h that is nearest to zero, before it and after; and the
     multiplier of the switch that has it."""
     unravel = jfu.ravel_pytree(like)[1]
 
-    def nearest(model: Model, t: Scalar, y: Y) -> Array:
+    def nearest(model: SwitchedSystem, t: Scalar, y: Y) -> Array:
         each = [() if isinstance(s, relay) else model.h(k, t, y) for k, s in enumerate(model.switches)]
         return jnp.stack([jnp.argmin(jnp.abs(jnp.stack(h))) if len(h) > 1 else jnp.zeros((), int) for h in each])
 
@@ -138,16 +138,18 @@ def _looked_at(model: Model, like: Y, systems: System, diaries: Diary) -> tuple[
     return jax.vmap(lambda system, diary: jax.vmap(partial(event, system))(*diary))(systems, diaries)
 
 
-def starts_of(model: Model, orbits: list[Orbit]) -> list[Start]:
+def starts_of(model: SwitchedSystem, orbits: list[Orbit]) -> list[Start]:
     """The courses of orbits of one model that differ in its parameters, from their events."""
-    diaries = [Diary.of(orbit.events) for orbit in orbits]
+    diaries = [EventRecord.of(orbit.events) for orbit in orbits]
     systems = [arrays_of(orbit.system, jnp.float64) for orbit in orbits]
     at = [(float(orbit.t0), float(orbit.period), np.asarray(orbit.mode, np.int32)) for orbit in orbits]
     x0 = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(orbit.y0)]) for orbit in orbits]
     return starts_from(model, orbits[0].y0, systems, diaries, [(*one, x) for one, x in zip(at, x0)])
 
 
-def starts_from(model: Model, like: Y, systems: list[System], diaries: list[Diary], at: list[tuple]) -> list[Start]:
+def starts_from(
+    model: SwitchedSystem, like: Y, systems: list[System], diaries: list[EventRecord], at: list[tuple]
+) -> list[Start]:
     """The same from what happens in a period that begins `at` (time, period, mode, state)."""
     capacity = capacity_for(max(len(diary.t) for diary in diaries))
     eventful = [i for i, diary in enumerate(diaries) if len(diary.t)]
@@ -173,7 +175,7 @@ def _uneventful(t0: float, period: float, mode: np.ndarray, x0: np.ndarray) -> S
     return Start(course, np.array([t0]), np.array([t0 + period]), x0[None])
 
 
-def _start(model: Model, diary: Diary, seen: tuple, period: float) -> Start:
+def _start(model: SwitchedSystem, diary: EventRecord, seen: tuple, period: float) -> Start:
     """From each event to the next."""
     n = len(diary.t)
     parts_before, parts_after, multipliers = seen

@@ -13,17 +13,17 @@ from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, R
 from ..._numerics._root import find_root
 from ..._types import Scalar
 from ...derivatives._floquet import floquet, structural_zeros
-from ...system._model import Model
+from ...system._model import SwitchedSystem
 from ...system._system import relay
 from ._equations import OrbitCurve, row_sizes
-from ._itinerary import Course, EVENT, FREE, TIME
+from ._itinerary import Course, EVENT, REPELLING_EXIT, TIME
 from ._segment_flow import with_parameter
 
 
 TOLERANCE = 1e-12  # of Newton's method, in units of the unknowns
 
 
-class Look(NamedTuple):
+class PointData(NamedTuple):
     """All that is seen of a point of the curve.
 
     - `u`, `tangent`: the unknowns, and the direction of the curve (of a surface, several); `good`: whether it is a
@@ -78,7 +78,7 @@ class Look(NamedTuple):
 
 def advance(
     curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array, newton: Array | bool = True
-) -> Look:
+) -> PointData:
     """The point of the curve at the distance `s` from `origin` along `border` (of a surface, at several distances along
     as many directions), and all that is seen of it; or, without
     `newton`, of the guess itself."""
@@ -89,14 +89,14 @@ def advance(
 @eqx.filter_jit
 def _advance(
     curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array, newton: Array
-) -> Look:
+) -> PointData:
     return step_on(curve, course, origin, border, s, guess, newton)
 
 
 def step_on(
     curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array,
     newton: Array | bool = True, turns: bool = True,
-) -> Look:  # fmt: skip
+) -> PointData:  # fmt: skip
     """`advance`, within a program; without `turns` the largest and least states are those at the nodes."""
 
     def residual(u: Array, _: Any) -> Array:
@@ -109,7 +109,7 @@ def step_on(
 
 def look_at(
     curve: OrbitCurve, u: Array, border: Array, course: Course, origin: Array, good: Array, turns: bool
-) -> Look:
+) -> PointData:
     begin, end, x, value = curve.parts(u)
     n, rows, m = len(curve.sizes), len(begin), curve.dimension
     model = with_parameter(curve.model, curve.path, value)
@@ -164,7 +164,7 @@ def look_at(
 
     zeros = structural_zeros(model.system, jnp.where((index < course.num)[:, None], mode, mode[:1]))
     found = floquet(factors, zeros, curve.autonomous)
-    free = jnp.any((course.ends == FREE) & (index < course.num))
+    free = jnp.any((course.ends == REPELLING_EXIT) & (index < course.num))
     either = zip(_infinitely_unstable(n, curve.autonomous), found)
     monodromy, multipliers, stable = (jnp.where(free, x, y) for x, y in either)
 
@@ -183,7 +183,7 @@ def look_at(
     # Beside a branch point rounding moves the root by more than Newton's method is to find it to.
     wrong = jnp.max(jnp.abs(f))
     good = (good | (wrong < TOLERANCE)) & jnp.all(jnp.isfinite(tangent))
-    return Look(
+    return PointData(
         u, tangent, good, value, period, begin, end, x, last, factors, monodromy, multipliers, stable,
         rates, values, margins, least, along.share[:, 2 * n :], along.most[:, 2 * n :], along.x[:, 2 * n :], low, -high,
         mean, square, along.ts, along.xs, turns_t, along.x[:, : 2 * n], branch, wrong,
@@ -208,8 +208,8 @@ def extremes(curve: OrbitCurve, course: Course, u: Array) -> tuple[Array, Array]
 
 
 def _along(
-    curve: OrbitCurve, model: Model, value: Array, begin: Array, end: Array, x: Array, course: Course, turns: bool,
-    guards: bool = True,
+    curve: OrbitCurve, model: SwitchedSystem, value: Array, begin: Array, end: Array, x: Array, course: Course,
+    turns: bool, guards: bool = True,
 ) -> Minima:  # fmt: skip
     """Of every segment the least values of the state's components, of their negatives (with `turns` between nodes too),
     and of the guards, these divided by the zeros that they must have at the ends."""
@@ -221,7 +221,7 @@ def _along(
         index = jnp.arange(rows, dtype=course.num.dtype)
         after = jnp.where(index >= course.num - 1, 0, index + 1)
         # On what is left freely it comes tangentially.
-        order = jnp.where(course.ends[after] == FREE, 2, 1)[:, None]
+        order = jnp.where(course.ends[after] == REPELLING_EXIT, 2, 1)[:, None]
         last = jnp.where((course.ends == EVENT)[:, None] & here, order, 0)
         orders = jnp.stack([zeros, last.astype(x.dtype)], axis=1)
     plain = jnp.zeros((rows, 2, 2 * len(curve.sizes)), x.dtype)
@@ -232,7 +232,7 @@ def _along(
 
 
 def along_segment(
-    curve: OrbitCurve, model: Model, value: Array, a: Scalar, b: Scalar, x: Array, mode: Array, part: Array,
+    curve: OrbitCurve, model: SwitchedSystem, value: Array, a: Scalar, b: Scalar, x: Array, mode: Array, part: Array,
     orders: Array, turns: bool = True,
 ) -> Minima:  # fmt: skip
     """As `_along`, of one segment, with any orders of the zeros."""
@@ -262,7 +262,7 @@ def along_segment(
     return in_order(minima(sample, functions, x, orders[:, places], below), places)
 
 
-def zeros_at_begin(curve: OrbitCurve, model: Model, course: Course) -> Array:
+def zeros_at_begin(curve: OrbitCurve, model: SwitchedSystem, course: Course) -> Array:
     """How many zeros each guard has at the beginning of each segment: that of the surface just left."""
     index = jnp.arange(len(course.slot), dtype=course.num.dtype)
     before = jnp.where(index == 0, course.num - 1, index - 1)
@@ -275,7 +275,7 @@ def zeros_at_begin(curve: OrbitCurve, model: Model, course: Course) -> Array:
     component = jnp.where(entry > 0, entry, jnp.where(part >= 0, part, 0))
     for s in model.slots:
         k = s.switch
-        left = (switch == k) & ((ends == EVENT) | (ends == FREE))
+        left = (switch == k) & ((ends == EVENT) | (ends == REPELLING_EXIT))
         if s.holding or isinstance(model.switches[k], relay):
             columns.append(jnp.zeros(len(index)))
             continue
@@ -294,7 +294,9 @@ def zeros_at_begin(curve: OrbitCurve, model: Model, course: Course) -> Array:
     return jnp.stack([c.astype(jnp.result_type(float)) for c in columns], axis=1)
 
 
-def _at_ends(curve: OrbitCurve, model: Model, end: Array, last: Array, course: Course) -> tuple[Array, Array, Array]:
+def _at_ends(
+    curve: OrbitCurve, model: SwitchedSystem, end: Array, last: Array, course: Course
+) -> tuple[Array, Array, Array]:
     """Rate and value of the guard that ends each segment, and |λ| - b where it crosses what could hold it."""
     if not model.slots:
         return -jnp.ones_like(end), jnp.zeros_like(end), jnp.ones_like(end)

@@ -19,7 +19,7 @@ from ..._types import Scalar, Y
 from ...flow._results import is_okay
 from ...flow._solve import solve
 from ...flow.steppers._exponential import affine_parts, expm, generator
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 from ...system._parameter import Path, put_parameter
 from ...system._system import System
 from ._arcs import Smooth
@@ -28,14 +28,14 @@ from ._arcs import Smooth
 NEVER, FREE_MODES, ALWAYS = range(3)  # when a mode's flow is known by its exponential
 
 
-def with_parameter(model: Model, path: Path, value: Array) -> Model:
+def with_parameter(model: SwitchedSystem, path: Path, value: Array) -> SwitchedSystem:
     return eqx.tree_at(lambda m: m.system, model, put_parameter(model.system, path, value))
 
 
 class SegmentFlow(eqx.Module):
     """The flow of each mode of a model, for any value of a parameter (or of several)."""
 
-    model: Model
+    model: SwitchedSystem
     path: Path = eqx.field(static=True)
     like: Y
     how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
@@ -45,25 +45,25 @@ class SegmentFlow(eqx.Module):
     def unravel(self, x: Array) -> Y:
         return jfu.ravel_pytree(self.like)[1](x)
 
-    def field(self, t: Scalar, x: Array, value: Array, state: State) -> Array:
+    def field(self, t: Scalar, x: Array, value: Array, state: ModeState) -> Array:
         model = with_parameter(self.model, self.path, value)
         if self.exact and not self.slides:
             model = model.within(state.mode)
             return jfu.ravel_pytree(model.field(t, self.unravel(x), model.signs(t, state)))[0]
         return jfu.ravel_pytree(model.flow(t, self.unravel(x), state))[0]
 
-    def generator(self, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> tuple:
+    def generator(self, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> tuple:
         """Of the exact flow from time a to b, see `generator`."""
         model = with_parameter(self.model, self.path, value)
         force = model.force(a, self.unravel(x), state) if self.slides else None
         f = self.field(a, x, value, state)
         return generator(lambda t, x: self.field(t, x, value, state), a, x, f, b - a, force)
 
-    def arrive(self, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> Array:
+    def arrive(self, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> Array:
         """The state at time b of the flow from `x` at time a."""
         return _arrive(self, a, b, x, value, state)
 
-    def along(self, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> tuple[Array, Array, Array]:
+    def along(self, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> tuple[Array, Array, Array]:
         """Times and states at the nodes `THETA` of the way (between steps they are those of the solver's dense output,
         less exact than the steps); and the integrals of the state and of its square."""
         theta = jnp.asarray(THETA, x.dtype)
@@ -84,18 +84,18 @@ class SegmentFlow(eqx.Module):
         return ts, jnp.where(span > 0, xs, x), jnp.where(span > 0, sums, 0)
 
 
-def exactness(model: Model, t: Scalar, y: Y) -> int:
+def exactness(model: SwitchedSystem, t: Scalar, y: Y) -> int:
     """Which modes have fields that are affine in the state, with a constant matrix."""
     zero = jnp.zeros((), jnp.int32)
     parts = tuple(zero if n > 1 else None for n in model.parts)
-    state = State(tuple(zero for _ in model.switches), parts, tuple(zero for _ in model.switches))
+    state = ModeState(tuple(zero for _ in model.switches), parts, tuple(zero for _ in model.switches))
     if not all(affine_parts(lambda t, y: model.field(t, y, model.signs(t, state)), t, y)):
         return NEVER
     return ALWAYS if all(affine_parts(lambda t, y: model.flow(t, y, state), t, y)) else FREE_MODES
 
 
 @eqx.filter_jit
-def fits(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> Array:
+def fits(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> Array:
     """Whether the forcing along a segment is of a kind that the exponential knows: at several times, as at one where
     its odd derivatives vanish two frequencies look like one."""
 
@@ -108,8 +108,8 @@ def fits(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state:
 class _Summed(System):
     """The field of one mode, and the integrals of the state and of its squares."""
 
-    model: Model
-    state: State
+    model: SwitchedSystem
+    state: ModeState
 
     def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
         y, _, _ = y
@@ -119,9 +119,9 @@ class _Summed(System):
 class _Varied(System):
     """A state, the parameter, and the derivatives of the state by those at the beginning, in one mode."""
 
-    model: Model
+    model: SwitchedSystem
     path: Path = eqx.field(static=True)
-    state: State
+    state: ModeState
 
     def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
         y, value, columns = y
@@ -135,7 +135,7 @@ class _Varied(System):
 
 
 def _exponential(
-    flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: State
+    flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState
 ) -> tuple[Array, Float[Array, "n n"]]:
     """The state at the end, and its derivative by that at the beginning."""
     m, scale, good = flow.generator(a, b, x, value, state)
@@ -143,7 +143,9 @@ def _exponential(
     return jnp.where(good, x + scale * e[:n, n], jnp.nan), e[:n, :n]
 
 
-def _samples(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: State) -> Float[Array, "nodes n"]:
+def _samples(
+    flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState
+) -> Float[Array, "nodes n"]:
     """States at the nodes: from those at equal distances, with three derivatives, by Hermite's polynomials of degree
     seven, which miss a 10321920th of the eighth power of the phase between two of them."""
     m, scale, good = flow.generator(a, b, x, value, state)
@@ -201,7 +203,7 @@ def _arrive_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
 
 
 def _varied(
-    flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: State
+    flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState
 ) -> tuple[Array, Float[Array, "n n"], Float[Array, "n parameters"]]:
     """The state at the end, and its derivatives by that at the beginning, and by the parameter."""
     n = len(x)

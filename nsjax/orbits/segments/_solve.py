@@ -21,21 +21,21 @@ from ...derivatives._saltation import fired, saltation_matrices
 from ...flow._results import is_okay, RESULTS
 from ...flow._solution import Events
 from ...flow.events._transition import cosine
-from ...system._model import Model, State
+from ...system._model import ModeState, SwitchedSystem
 from ...system._system import System
 from .._orbit import fractions, judge, Orbit, ravel
 from ._arcs import Arcs, Flows, model_of, SAMPLES
-from ._guess import Cuts, landing, where
+from ._guess import landing, SegmentGuess, where
 
 
-def _guard(model: Model, k: Array, t: Scalar, y: Y, state: State) -> Scalar:
+def _guard(model: SwitchedSystem, k: Array, t: Scalar, y: Y, state: ModeState) -> Scalar:
     out = jnp.zeros_like(t)
     for i in range(len(model.switches)):
         out = jnp.where(k == i, fired(model, i, t, y, state), out)
     return out
 
 
-def _tangency(model: Model, k: Array, t: Scalar, y: Y, state: State) -> Scalar:
+def _tangency(model: SwitchedSystem, k: Array, t: Scalar, y: Y, state: ModeState) -> Scalar:
     """|λ| - 1: zero where the field beside the surface becomes parallel to it."""
     values, out = model.values(t, y, state), jnp.zeros_like(t)
     for i in model.holdable:
@@ -49,7 +49,7 @@ class _Cycle(eqx.Module):
     The unknowns of a segment are its times of beginning and end, and its states at the beginning of each of its pieces.
     """
 
-    cuts: Cuts
+    cuts: SegmentGuess
     t0: Scalar
     y0: Y
     order: int = eqx.field(static=True)
@@ -89,7 +89,7 @@ class _Cycle(eqx.Module):
         """The states after the events, and the times up to where impacts have come to rest."""
         model = model_of(system, self.t0, self.y0)
 
-        def row(k: Array, t: Scalar, x: Array, ending: State, after: tuple) -> tuple[Array, Scalar]:
+        def row(k: Array, t: Scalar, x: Array, ending: ModeState, after: tuple) -> tuple[Array, Scalar]:
             y, rest = landing(model, k, t, self.unravel(x), ending, after)
             return ravel(y), rest
 
@@ -138,7 +138,7 @@ class _Cycle(eqx.Module):
 
 @eqx.filter_jit
 def by_segments(
-    system: System, cuts: Cuts, t0: Scalar, order: int, pieces: int, how: dict, tol: float, max_iterations: int
+    system: System, cuts: SegmentGuess, t0: Scalar, order: int, pieces: int, how: dict, tol: float, max_iterations: int
 ) -> Orbit:
     """Newton's method on the equations of all segments, and what is said of the orbit."""
     autonomous = system.period is None
@@ -204,7 +204,7 @@ def _log(system: System, cycle: _Cycle, end: Array, last: Array) -> Events:
     after, rest = cycle.jumps(system, end, last)
     model = model_of(system, end[0], unravel(last[0]))
 
-    def square(k: Array, t: Scalar, x: Array, s: State) -> Scalar:
+    def square(k: Array, t: Scalar, x: Array, s: ModeState) -> Scalar:
         h_t, n = jax.grad(lambda t, x: _guard(model, k, t, unravel(x), s), argnums=(0, 1))(t, x)
         return cosine(h_t, n, ravel(model.flow(t, unravel(x), s)))
 
@@ -259,7 +259,7 @@ def _violation(system: System, cycle: _Cycle, begin: Array, end: Array, x: Array
     starts = begin[:, None] + (end - begin)[:, None] * jnp.arange(cycle.pieces, dtype=end.dtype) / cycle.pieces
     stops = jnp.concatenate([starts[:, 1:], end[:, None]], axis=1)
 
-    def piece(a: Scalar, b: Scalar, x: Array, within: State, ending: State) -> tuple[Array, Array, Array]:
+    def piece(a: Scalar, b: Scalar, x: Array, within: ModeState, ending: ModeState) -> tuple[Array, Array, Array]:
         def guards(t: Scalar, x: Array) -> list[list[Scalar]]:
             return [row for state in (within, ending) for row in model.guards(t, cycle.unravel(x), state)]
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ...._types import Scalar
 from ....orbits.segments._equations import OrbitCurve
 from ....orbits.segments._itinerary import Course
-from ....orbits.segments._point import Look, step_on
+from ....orbits.segments._point import PointData, step_on
 from .._test_functions import BRANCH, branch_value, CIRCLE, circle_values, corner_tests, corner_values, PASSED, Test
 from .._tracer import FIRST, SHORTEST, TURN, TURNED
 
@@ -68,7 +68,7 @@ def lane_tests(rows: int, slots: int) -> list[Test]:
     return [Test("low"), Test("high"), *corner_tests(rows, slots), Test("fold"), BRANCH, *CIRCLE]
 
 
-def values_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Array:
+def values_of(curve: OrbitCurve, look: PointData, course: Course, log: Scalar) -> Array:
     share = look.u[-1]
     corners, there = corner_values(curve, look, course)
     smooth = jnp.stack([look.tangent[-1], branch_value(look, log)])
@@ -77,7 +77,7 @@ def values_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Arr
     return jnp.concatenate([ends, jnp.where(there, corners, 1), smooth, circle])
 
 
-def place_of(curve: OrbitCurve, look: Look, course: Course, log: Scalar) -> Place:
+def place_of(curve: OrbitCurve, look: PointData, course: Course, log: Scalar) -> Place:
     # In the middle of the longest segment, if possible of one that no surface holds.
     mode, held = jnp.asarray(course.mode), jnp.zeros(len(look.begin), bool)
     for k in curve.model.holdable:

@@ -4,7 +4,7 @@ import numpy as np
 
 from ....maps._corner_normal_form import corner_kind, CornerMap, Cycle, Cycles, find_cycles
 from ....orbits.segments._equations import linearised, OrbitCurve
-from ....orbits.segments._itinerary import capacity_for, EVENT, FREE, LEAST, Start
+from ....orbits.segments._itinerary import capacity_for, EVENT, GRAZING, REPELLING_EXIT, Start
 from ....setvalued._eigenvalue_crossings import eigenvalue_crossings
 from ....system._system import impact
 from .._bifurcation import named, OrbitBifurcation, Origin
@@ -22,7 +22,7 @@ from .._branch_switching import (
     with_order,
 )
 from .._test_functions import CORNERS
-from .._tracer import OrbitTracer, Spot, Zero
+from .._tracer import OrbitPoint, OrbitTracer, Zero
 from ._enter_half_branch import half_of, NEIGHBOUR
 from ._return_map import return_map, ReturnMap, Touch, touches_of
 
@@ -103,7 +103,7 @@ def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple
     border = np.zeros_like(u)
     border[-1] = 1.0
     if (
-        zero.test.kind == "duration" and short.ends[len(lap_rows) - 1] != LEAST
+        zero.test.kind == "duration" and short.ends[len(lap_rows) - 1] != GRAZING
     ):  # it stays zero: the parameter may be least there
         at = (len(lap_rows) - 1) * (len(curve.sizes) + 2)
         border[[-1, at, at + 1]] = 0.0, -1.0, 1.0
@@ -114,7 +114,7 @@ def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple
     return once, zero._replace(spot=spot, test=tests[0], others=tuple(tests[1:]))
 
 
-def is_impact(curve: OrbitCurve, spot: Spot, row: int) -> bool:
+def is_impact(curve: OrbitCurve, spot: OrbitPoint, row: int) -> bool:
     """Whether a segment ends with an impact: one that becomes a grazing does nothing any more."""
     slot = curve.model.slots[int(spot.course.slot[row])]
     return isinstance(curve.model.switches[slot.switch], impact) and not slot.holding
@@ -175,7 +175,7 @@ def _monodromy(mapped: ReturnMap, word: tuple[int, ...]) -> np.ndarray:
 def described(
     name: str,
     curve: OrbitCurve,
-    spot: Spot,
+    spot: OrbitPoint,
     mapped: ReturnMap,
     cycles: Cycles,
     halves: list[Half],
@@ -220,7 +220,7 @@ def described(
     )
 
 
-def _held(curve: OrbitCurve, spot: Spot) -> int:
+def _held(curve: OrbitCurve, spot: OrbitPoint) -> int:
     """How many segments a surface holds."""
     return sum(curve.model.holds(spot.course.mode[i]) for i in spot.course.rows)
 
@@ -242,7 +242,7 @@ def _reduced(curve: OrbitCurve, monodromy: np.ndarray) -> np.ndarray:
     return frame @ monodromy @ frame.T
 
 
-def repelled_at(tracer: OrbitTracer, name: str, spot: Spot, rows: list[int]) -> Node | None:
+def repelled_at(tracer: OrbitTracer, name: str, spot: OrbitPoint, rows: list[int]) -> Node | None:
     """Where the orbit comes tangentially onto a surface that static friction holds: beyond, orbits slide on it where it
     repels, and may leave it at any point (section 6.7)."""
     curve, n = tracer.curve, int(spot.course.num)
@@ -252,7 +252,7 @@ def repelled_at(tracer: OrbitTracer, name: str, spot: Spot, rows: list[int]) -> 
     if not (slot.holding and curve.model.static(slot.switch)) or spot.course.ends[after] != EVENT:
         return None
     ends = np.array(spot.course.ends)
-    ends[after] = FREE
+    ends[after] = REPELLING_EXIT
     halves = []
     for course in (spot.course, spot.course._replace(ends=ends)):
         kernel = np.linalg.svd(np.asarray(linearised(curve, course, spot.look.u)))[2][-1]

@@ -10,11 +10,11 @@ import numpy as np
 
 from ....maps._corner_normal_form import CornerMap, Cycle
 from ....orbits.segments._equations import OrbitCurve
-from ....orbits.segments._itinerary import Diary, same_course, Start, starts_from
+from ....orbits.segments._itinerary import EventRecord, same_course, Start, starts_from
 from ....orbits.segments._segment_flow import with_parameter
 from .._branch_switching import admissible, Half, together, tracer_for, with_order
 from .._test_functions import PASSED
-from .._tracer import Arc, OrbitTracer, Spot, turned
+from .._tracer import Arc, OrbitPoint, OrbitTracer, turned
 from ._grazing import exactly
 from ._return_map import Base, follow, frame
 
@@ -25,7 +25,7 @@ BACK = 40  # points from there to the corner
 NEIGHBOUR = 1e-5  # at which the corner is known again
 
 
-def half_of(tracer: OrbitTracer, spot: Spot, corner: CornerMap, points: list[Base], cycle: Cycle) -> Half | None:
+def half_of(tracer: OrbitTracer, spot: OrbitPoint, corner: CornerMap, points: list[Base], cycle: Cycle) -> Half | None:
     """The orbit that a cycle of the normal form foretells, a little way off: piece by piece by the flow, which finds
     its itinerary, and then corrected."""
     own = tracer_for(tracer, with_order(tracer.curve, int(tracer.curve.order) * cycle.laps))
@@ -49,7 +49,9 @@ def _pushed(corner: CornerMap, cycle: Cycle, size: float) -> np.ndarray:
     return size * toward[:, None] * corner.n[places] * np.max(np.abs(cycle.points)) ** 2
 
 
-def _entered(tracer: OrbitTracer, spot: Spot, points: list[Base], cycle: Cycle, distance: float) -> Spot | None:
+def _entered(
+    tracer: OrbitTracer, spot: OrbitPoint, points: list[Base], cycle: Cycle, distance: float
+) -> OrbitPoint | None:
     """Corrected across the way on which the foretold orbits lie: at one parameter there may be none, where the branch
     turns round next to the corner."""
     curve = tracer.curve
@@ -61,7 +63,7 @@ def _entered(tracer: OrbitTracer, spot: Spot, points: list[Base], cycle: Cycle, 
     return tracer.corrected(far.filled().course, guess, (guess - before) / np.linalg.norm(guess - before))
 
 
-def _beside(tracer: OrbitTracer, at: Spot, found: Spot) -> Spot | None:
+def _beside(tracer: OrbitTracer, at: OrbitPoint, found: OrbitPoint) -> OrbitPoint | None:
     """The orbit between a corner and whatever else there is on the way to it from an orbit, whose tangent should point
     away from the corner; None if the way does not come there."""
     short = dataclasses.replace(tracer, max_points=BACK)
@@ -85,7 +87,7 @@ def _beside(tracer: OrbitTracer, at: Spot, found: Spot) -> Spot | None:
     return None
 
 
-def _foretold(curve: OrbitCurve, spot: Spot, points: list[Base], cycle: Cycle, distance: float) -> Start | None:
+def _foretold(curve: OrbitCurve, spot: OrbitPoint, points: list[Base], cycle: Cycle, distance: float) -> Start | None:
     m, period = len(points), float(spot.look.period)
     count = m * cycle.laps
     sizes = np.asarray(curve.sizes)
@@ -105,10 +107,10 @@ def _foretold(curve: OrbitCurve, spot: Spot, points: list[Base], cycle: Cycle, d
     slow = 1.0 if curve.autonomous else float(there.period) / float(here.period)
     diaries = []
     for lane in range(count):
-        diary = Diary.of(jax.tree.map(lambda leaf: leaf[lane], events))
+        diary = EventRecord.of(jax.tree.map(lambda leaf: leaf[lane], events))
         diaries.append(diary._replace(t=diary.t + (lane // m) * period * slow))
     at = begin[0] * slow, cycle.laps * period * slow, modes[0], x[0]
-    diary = functools.reduce(Diary.joined, diaries)
+    diary = functools.reduce(EventRecord.joined, diaries)
     if curve.autonomous and len(diary.t):  # time counts from the first event, as on the curve
         diary = diary._replace(t=diary.t - diary.t[0])
     return starts_from(curve.model, curve.like, [there], [diary], [at])[0]

@@ -9,11 +9,11 @@ import numpy as np
 
 from ...._numerics._bracket import bracketed
 from ....orbits.segments._equations import OrbitCurve
-from ....orbits.segments._itinerary import capacity_for, Course, EVENT, LEAST, Start, TIME
+from ....orbits.segments._itinerary import capacity_for, Course, EVENT, GRAZING, Start, TIME
 from ....orbits.segments._segment_flow import with_parameter
 from ....system._system import impact
 from .._test_functions import Test
-from .._tracer import alike, OrbitTracer, Spot, Zero
+from .._tracer import alike, OrbitPoint, OrbitTracer, Zero
 
 
 TANGENTIAL = 0.1  # the rate of a guard, in units of the curve, below which a segment that vanishes may be a grazing
@@ -57,7 +57,7 @@ def touching_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
     targets = [kept.index(i) for i in before]
     course = c.take(kept, capacity_for(len(kept)))
     ends = np.array(course.ends)
-    ends[targets] = LEAST
+    ends[targets] = GRAZING
     start = Start(course._replace(ends=ends), look.begin[kept], look.end[kept], look.x[kept])
     at = tracer.corrected(start.course, curve.pack(start, zero.spot.parameter))
     found = None if at is None else _zero_along(tracer, at, targets[0])
@@ -95,7 +95,7 @@ def grazing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
     return None
 
 
-def _cut(tracer: OrbitTracer, spot: Spot, cuts: list[tuple[int, int]]) -> tuple[Spot, list[int]] | None:
+def _cut(tracer: OrbitTracer, spot: OrbitPoint, cuts: list[tuple[int, int]]) -> tuple[OrbitPoint, list[int]] | None:
     """The orbit with cuts where these guards are least along these segments, at the parameter at which the first of
     them vanishes; and the segments that end with the cuts."""
     start, by_cut = cut_course(tracer.curve, spot, cuts)
@@ -106,7 +106,9 @@ def _cut(tracer: OrbitTracer, spot: Spot, cuts: list[tuple[int, int]]) -> tuple[
     return None if found is None else (found, [by_cut[pair] for pair in cuts])
 
 
-def cut_course(curve: OrbitCurve, spot: Spot, cuts: list[tuple[int, int]]) -> tuple[Start, dict[tuple[int, int], int]]:
+def cut_course(
+    curve: OrbitCurve, spot: OrbitPoint, cuts: list[tuple[int, int]]
+) -> tuple[Start, dict[tuple[int, int], int]]:
     """An orbit cut where these guards are least along these segments; and which segment ends with which cut."""
     look, n = spot.look, int(spot.course.num)
     c = spot.course
@@ -120,7 +122,7 @@ def cut_course(curve: OrbitCurve, spot: Spot, cuts: list[tuple[int, int]]) -> tu
         for share, j in inside:
             t = look.begin[i] + share * span
             entry = _component(curve, look, c, i, j, t)
-            rows.append((c.mode[i], c.part[i], LEAST, j, entry, begin, t, x))
+            rows.append((c.mode[i], c.part[i], GRAZING, j, entry, begin, t, x))
             order[i, j] = len(rows) - 1
             begin, x = t, look.spots[i, j]
         rows.append((c.mode[i], c.part[i], c.ends[i], c.slot[i], c.entry[i], begin, look.end[i], x))
@@ -165,10 +167,10 @@ def _component(curve: OrbitCurve, look: Any, course: Course, i: int, j: int, t: 
     return best
 
 
-def _zero_along(tracer: OrbitTracer, at: Spot, row: int) -> Spot | None:
+def _zero_along(tracer: OrbitTracer, at: OrbitPoint, row: int) -> OrbitPoint | None:
     """The point of the curve, next to one, at which the guard at the end of a segment vanishes."""
 
-    def value(spot: Spot) -> float:
+    def value(spot: OrbitPoint) -> float:
         return float(spot.look.ends[row])
 
     if value(at) == 0:
