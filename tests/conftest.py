@@ -16,9 +16,7 @@ import pytest
 # (Results must not depend on rounding: `XLA_FLAGS=--xla_backend_optimization_level=0`, which leaves out fused
 # multiplication and addition, is a second setting to run them in, and a sixth faster.)
 if jaxlib.__version__.startswith("0.10."):  # an unknown flag ends the process
-    # And its pool of threads may come to a standstill in large batched programs, with nothing left running.
-    flags = "--xla_cpu_use_fusion_emitters=false --xla_cpu_multi_thread_eigen=false"
-    os.environ["XLA_FLAGS"] = f"{flags} {os.environ.get('XLA_FLAGS', '')}"
+    os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}"
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(__file__).parents[1] / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

@@ -1,6 +1,5 @@
 """The laws of the switches at their surfaces: what an assignment of hold and release leads to, if it is valid."""
 
-import functools as ft
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -10,9 +9,6 @@ from ..._numerics._linalg import nearly
 from ..._types import Scalar, Y
 from ...system._model import ModeState, SwitchedSystem
 from ._attraction import attraction, negligible, Pairs, reach
-
-
-TRIED = 4  # up to this many switches at their surfaces, every assignment is tried
 
 
 class Outcome(NamedTuple):
@@ -44,11 +40,6 @@ class Instant(NamedTuple):
     @property
     def came(self) -> dict[int, Int[Array, ""]]:
         return {k: self.state.mode[k] for k in self.at}
-
-    @property
-    def many(self) -> Bool[Array, ""]:
-        """Whether too many switches are at their surfaces to try every assignment."""
-        return ft.reduce(jnp.add, [at.astype(jnp.int32) for at in self.at.values()]) > TRIED
 
     @property
     def starts(self) -> bool:

@@ -15,7 +15,10 @@ from ..._numerics._linalg import nearly
 from ..._types import Scalar, Y
 from ...system._model import ModeState, SwitchedSystem
 from ._attraction import coinciding, reach
-from ._laws import Instant, judge, Outcome, TRIED
+from ._laws import Instant, judge, Outcome
+
+
+_TRIED = 4  # up to this many switches, every assignment is tried
 
 
 def settle(
@@ -30,11 +33,10 @@ def settle(
     """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}, every contact one from {1, 0}.
 
     An assignment is valid if each that holds has |λ| <= b (a contact a force λ >= 0) and each other one moves to its
-    side. Where up to four switches are at their surfaces every assignment is tried; of the valid ones those are
-    preferred in which no surface that repels holds what arrives at it, of these the ones that hold most, that keep what
-    held before, and that cross what is met. Where more are, all are held that attract, the one that violates its law
-    most is released, to the sign of its λ, and a released switch whose motion then opposes this is taken back, until
-    nothing is violated.
+    side. Of up to four switches every assignment is tried; of the valid ones those are preferred in which no surface
+    that repels holds what arrives at it, of these the ones that hold most, that keep what held before, and that
+    cross what is met. Of more, all are held that attract, the one that violates its law most is released, to the sign
+    of its λ, and a released switch whose motion then opposes this is taken back, until nothing is violated.
 
     **Arguments:**
 
@@ -64,16 +66,14 @@ def settle(
         here = _together(here, trial)
         for k in filter(here.dry, which):
             trial[k] = jnp.where(here.at[k], 0, trial[k])
-    noise = here.noise(here.look(trial).s if model.contacts else {})
-    trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
-    if len(which) == 1:
-        trial, seen, others, wrong = _alone(here, trial, noise)
-    elif len(which) <= TRIED:
+    every = 1 < len(which) <= _TRIED
+    seen = here.look(trial) if model.contacts or not every else None
+    noise = here.noise(seen.s if seen else {})
+    if every:
         trial, seen, others, wrong = _best(here, trial, noise)
     else:
-        trial, seen, others, wrong = lax.cond(
-            here.many, ft.partial(_search, here), ft.partial(_best, here), trial, noise
-        )
+        assert seen is not None
+        trial, seen, others, wrong = (_alone if len(which) == 1 else _search)(here, trial, seen, noise)
     at, leaves, state = here.at, here.leaves, here.state
     s, rates, slopes, _ = seen
     if model.contacts and len(model.holdable) > 1:
@@ -160,29 +160,16 @@ def _elsewhere(
     return jnp.any(differs & clear[:, None], axis=0)
 
 
-def _assignments(here: Instant) -> tuple[Int[Array, "rows m"], Bool[Array, " rows"]]:
-    """All assignments of up to four switches that are at their surfaces, one a row; and which of the rows there are."""
-    model, which = here.model, here.which
-    options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
-    # A switch that is not at its surface has no choice: its first option stands for what it is.
-    at = jnp.stack([here.at[k] for k in which])
-    if len(which) <= TRIED:
-        table = np.array(list(itertools.product(*options)), np.int32)
-        return jnp.asarray(table), jnp.all(at | (table == np.array([o[0] for o in options], np.int32)), axis=1)
-    codes = np.array(list(itertools.product(range(3), repeat=TRIED)))  # which option the first, second, ... has
-    rank = jnp.cumsum(at) - 1
-    code = jnp.where(at, jnp.asarray(codes)[:, jnp.clip(rank, 0, TRIED - 1)], 0)
-    idle = np.arange(TRIED) > rank[-1]
-    real = jnp.all(code < np.array([len(o) for o in options]), axis=1) & jnp.all(~idle | (codes == 0), axis=1)
-    return jnp.asarray([(*o, 0)[:3] for o in options], jnp.int32)[np.arange(len(which)), code], real
-
-
 def _best(here: Instant, trial: dict, noise: dict) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
     """The assignment to be preferred, of all that are valid; what it leads to; of each switch whether another solution
     gives it another mode; and whether the choice is open."""
-    which = here.which
-    table, real = _assignments(here)
+    model, which = here.model, here.which
+    options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
+    table = jnp.asarray(np.array(list(itertools.product(*options)), np.int32))
     found = jax.vmap(ft.partial(judge, here, trial, noise))(table)
+    # A switch that is not at its surface has no choice: its first option stands for what it is.
+    at = jnp.stack([here.at[k] for k in which])
+    real = jnp.all(at | (table == np.array([o[0] for o in options], np.int32)), axis=1)
     score = jnp.where(found.valid & real, found.rank, -1)
     best = jnp.argmax(score)
     seen = jax.tree.map(lambda x: x[best], found.seen)
@@ -210,10 +197,11 @@ def _guess(here: Instant, trial: dict, seen: Outcome) -> dict:
     return out
 
 
-def _alone(here: Instant, trial: dict, noise: dict) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
+def _alone(
+    here: Instant, trial: dict, seen: Outcome, noise: dict
+) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
     """The same as `_best` for one switch, which has no choice."""
     ((k, at),) = here.at.items()
-    seen = here.look(trial)
     first = _guess(here, trial, seen)
     trial = _amend(here, first, here.look(first), noise)[0]
     forked = jnp.zeros((), bool)
@@ -230,9 +218,11 @@ def _either(multiplier: Scalar, bound: Any, slope: Scalar) -> Bool[Array, ""]:
     return (size <= bound) & ((slope > 0) | (size > 1 + nearly(size)))
 
 
-def _search(here: Instant, trial: dict, noise: dict) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
-    """The same where too many are at their surfaces to try every assignment."""
-    which, came, seen = here.which, here.came, here.look(trial)
+def _search(
+    here: Instant, trial: dict, seen: Outcome, noise: dict
+) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
+    """The same where there are too many to try every assignment."""
+    which, came = here.which, here.came
     trial = _guess(here, trial, seen)
     # A bound that is reached together with that of another switch is left with it, not in a second event.
     leaves = dict(here.leaves)
@@ -255,7 +245,7 @@ def _search(here: Instant, trial: dict, noise: dict) -> tuple[dict, Outcome, Boo
         return wrong & (count < 2 * len(which) + 2)
 
     trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
-    begin = (jnp.zeros((), jnp.int32), trial, here.many)
+    begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
     _, trial, wrong = lax.while_loop(unsettled, amend, begin)
     # Of all other assignments those in which one switch, or one group on surfaces that coincide, is let go or held.
     chosen, seen, table = jnp.stack([trial[k] for k in which]), here.look(trial), []
