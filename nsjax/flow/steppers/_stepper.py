@@ -131,7 +131,7 @@ class Stepper(eqx.Module):
         return c[-1], (len(c) - 1) * (c[-1] - c[-2])
 
     def scaled(self, model: SwitchedSystem, guards: list[list[list[Scalar]]]) -> list[Float[Array, "slots parts"]]:
-        """The polynomials of the guards as `_crossing` wants them: coefficients in Σ a_j u^j (1 - u)^(n - j)."""
+        """The polynomials of the guards as `_bernstein` wants them: coefficients in Σ a_j u^j (1 - u)^(n - j)."""
         n = max(len(c) for row in guards for c in row) - 1
 
         def raised(c: list[Scalar]) -> list[Scalar]:
