@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 from affine import Affine
 from exact import Case, Shape
-from models import pid
-from trajectory import count, share, slopes_agree, Solved, told_but_ambiguous
-
-import nsjax
+from trajectory import count, share, slopes_agree, Solved, tightly, told_but_ambiguous
 
 
 # One compiled program each.
@@ -35,27 +32,14 @@ MAX_EVENTS = 40
     static_argnames=("shape", "solver", "derive"),
     compiler_options={"xla_backend_optimization_level": 0},
 )
-def run(cases: Case, shape: Shape, solver: dfx.AbstractSolver, derive: bool) -> tuple:
+def run(cases: Case, shape: Shape, solver: dfx.AbstractSolver, derive: bool) -> Solved:
     def one(case: Case):
         def flow(y0):
-            system = Affine(*case[:7], shape)
-            sol = nsjax.solve(
-                system,
-                0.0,
-                case.t1,
-                y0,
-                solver=solver,
-                stepsize_controller=pid(1e-10),
-                max_events=MAX_EVENTS + 8,
-                throw=False,
-            )
+            sol = tightly(Affine(*case[:7], shape), case.t1, y0, solver, MAX_EVENTS)
             return sol.y1, sol
 
         jacobian, sol = jax.jacfwd(flow, has_aux=True)(case.y0) if derive else (None, flow(case.y0)[1])
-        solved = sol.result == nsjax.RESULTS.successful
-        ambiguous = sol.result == nsjax.RESULTS.ambiguous_event
-        events = sol.events
-        return events.t, events.switch, events.mode_after, sol.y1, sol.mode1, jacobian, solved, ambiguous
+        return Solved.of(sol, jacobian)
 
     return jax.vmap(one)(cases)
 

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from affine import Affine, switches
 from clocked import Case, Clocks, Shape
-from models import pid
-from trajectory import count, share, Solved, told_but_ambiguous
+from trajectory import count, share, Solved, tightly, told_but_ambiguous
 
 import nsjax
 
@@ -72,25 +71,13 @@ def run(cases: Case, shape: Shape, solver: dfx.AbstractSolver, derive: bool) -> 
     def one(case: Case):
         def flow(y0, period):
             clocks = case.clocks._replace(period=period)
-            sol = nsjax.solve(
-                Clocked(*case.plain[:7], shape.plain, clocks, shape.clocks),
-                0.0,
-                case.plain.t1,
-                y0,
-                solver=solver,
-                stepsize_controller=pid(1e-10),
-                max_events=MAX_EVENTS + 8,
-                throw=False,
-            )
+            system = Clocked(*case.plain[:7], shape.plain, clocks, shape.clocks)
+            sol = tightly(system, case.plain.t1, y0, solver, MAX_EVENTS)
             return sol.y1, sol
 
         at = (case.plain.y0, case.clocks.period)
         derivatives, sol = jax.jacfwd(flow, (0, 1), has_aux=True)(*at) if derive else ((None, None), flow(*at)[1])
-        solved = sol.result == nsjax.RESULTS.successful
-        ambiguous = sol.result == nsjax.RESULTS.ambiguous_event
-        events = sol.events
-        found = Solved(events.t, events.switch, events.mode_after, sol.y1, sol.mode1, derivatives[0], solved, ambiguous)
-        return found, derivatives[1]
+        return Solved.of(sol, derivatives[0]), derivatives[1]
 
     return jax.vmap(one)(cases)
 

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from curved import Case, Shape
 from jaxtyping import Array
-from models import pid
 from scipy.integrate import solve_ivp
-from trajectory import count, share, slopes_agree, Solved, told_but_ambiguous
+from trajectory import count, share, slopes_agree, Solved, tightly, told_but_ambiguous
 
 import nsjax
 
@@ -73,21 +72,7 @@ def _switches(shape: Shape) -> tuple[nsjax.sgn, ...]:
 @functools.partial(jax.jit, static_argnames=("shape", "solver"), compiler_options={"xla_backend_optimization_level": 0})
 def run(cases: Case, shape: Shape, solver: dfx.AbstractSolver) -> Solved:
     def one(case: Case):
-        sol = nsjax.solve(
-            Curved(*case[:7], shape),
-            0.0,
-            case.t1,
-            case.y0,
-            solver=solver,
-            stepsize_controller=pid(1e-10),
-            max_events=MAX_EVENTS + 8,
-            throw=False,
-        )
-        solved = sol.result == nsjax.RESULTS.successful
-        ambiguous = sol.result == nsjax.RESULTS.ambiguous_event
-        return Solved(
-            sol.events.t, sol.events.switch, sol.events.mode_after, sol.y1, sol.mode1, None, solved, ambiguous
-        )
+        return Solved.of(tightly(Curved(*case[:7], shape), case.t1, case.y0, solver, MAX_EVENTS))
 
     return jax.vmap(one)(cases)
 

@@ -7,6 +7,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from models import pid
+
+from nsjax import RESULTS, solve
 
 
 EPS = 1e-7  # how near to a tangency, or to another event, a guard may come before the case is called sensitive
@@ -158,6 +161,26 @@ class Solved(NamedTuple):
     jacobian: np.ndarray | None
     solved: np.ndarray
     ambiguous: np.ndarray
+
+    @classmethod
+    def of(cls, sol, jacobian=None):
+        events = sol.events
+        solved, ambiguous = (sol.result == what for what in (RESULTS.successful, RESULTS.ambiguous_event))
+        return cls(events.t, events.switch, events.mode_after, sol.y1, sol.mode1, jacobian, solved, ambiguous)
+
+
+def tightly(system, t1, y0, solver, max_events: int):
+    """The solution that is compared with a reference of up to so many events."""
+    return solve(
+        system,
+        0.0,
+        t1,
+        y0,
+        solver=solver,
+        stepsize_controller=pid(1e-10),
+        max_events=max_events + 8,
+        throw=False,
+    )
 
 
 def compare(truth: Trajectory, got: Solved) -> str:
