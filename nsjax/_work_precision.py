@@ -22,7 +22,9 @@ from .orbits._find_orbit import find_orbit
 from .orbits._orbit import Orbit
 from .regularise._regularise import banded, smoothed
 from .system._checks import check_system
-from .system._system import AbstractSwitch, forwarded, sgn, SwitchValues, System
+from .system._sgn import sgn
+from .system._switch import AbstractSwitch, forwarded
+from .system._system import SwitchValues, System
 
 
 class Method(NamedTuple):

@@ -7,7 +7,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from ..system._system import impact, sgn, System
+from ..system._system import System
 
 
 LAPS = 8  # of orthogonal iteration: multipliers farther apart than a factor of forty are told apart to all digits
@@ -18,11 +18,8 @@ def structural_zeros(system: System, modes: Int[Array, "arcs switches"]) -> Int[
     perturbations, each contact that rests two, and what is lost on one arc of the orbit is lost for all."""
     lost = jnp.zeros(len(modes), jnp.int32)
     for k, switch in enumerate(system.switches):
-        if isinstance(switch, (impact, sgn)):
-            held = (
-                jnp.where(modes[:, k] == 1, 2, 0) if isinstance(switch, impact) else jnp.where(modes[:, k] == 0, 1, 0)
-            )
-            lost += held.astype(lost.dtype)
+        if switch.order:
+            lost += jnp.where(modes[:, k] == switch.holding, switch.order, 0).astype(lost.dtype)
     return jnp.max(lost)
 
 

@@ -12,9 +12,11 @@ from jaxtyping import Array, Float, Int
 from .._numerics._autodiff import frozen
 from .._types import Scalar, Y
 from ..flow._solution import Events
-from ..flow.events._transition import completed, rebound
-from ..system._model import ModeState, SwitchedSystem
-from ..system._system import arrays_of, clock, impact, relay, System
+from ..flow.events._impact import completed, rebound
+from ..system._impact import impact
+from ..system._mode import ModeState
+from ..system._model import SwitchedSystem
+from ..system._system import arrays_of, System
 
 
 def _float(t: Any, y: Y) -> tuple[Scalar, Y]:
@@ -39,32 +41,21 @@ def _modes(system: System, mode: Any) -> tuple[Int[Array, ""], ...]:
 
 def states(model: SwitchedSystem, t: Scalar, y: Y, mode: tuple) -> ModeState:
     """A mode with the component of h that is on its surface: the one nearest to zero."""
-    parts = tuple(
-        None
-        if model.parts[k] == 1 or isinstance(switch, relay)
-        else jnp.argmin(jnp.abs(jnp.stack(model.h(k, t, y)))).astype(jnp.int32)
-        for k, switch in enumerate(model.switches)
-    )
-    return ModeState(mode, parts, tuple(jnp.zeros((), jnp.int32) for _ in mode))
+    parts = [
+        None if n == 1 else jnp.argmin(jnp.abs(jnp.stack(model.h(k, t, y)))).astype(jnp.int32)
+        for k, n in enumerate(model.parts)
+    ]
+    return ModeState.of(mode, parts)
 
 
 def fired(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
     """The guard of switch k that is at zero: its surface, or while sliding the bound that λ has reached."""
-    switch = model.switches[k]
-    mode = state.mode[k]
-    if isinstance(switch, relay):
-        on = switch.guard(model.system, t, y)
-        assert switch.off_guard is not None
-        return jnp.where(mode == 1, switch.off_guard(model.system, t, y), on)
-    if isinstance(switch, clock):
-        return model.span(k, state.mode)[1] - t
-    h = model.h(k, t, y)
-    surface = h[0] if len(h) == 1 else jnp.stack(h)[state.part[k]]
+    surface = model.switches[k].surface(model, k, t, y, state)
     if k not in model.holdable:
         return surface
     lam = model.values(t, y, state)[k]
     left = lam if k in model.contacts else model.bound(k) - jnp.sign(lam) * lam
-    return jnp.where(model.held(k, mode), left, surface)
+    return jnp.where(model.held(k, state.mode[k]), left, surface)
 
 
 def landed(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState, after: tuple) -> tuple[Y, Scalar]:

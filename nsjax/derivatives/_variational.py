@@ -15,7 +15,8 @@ from ..flow._arguments import check_solve
 from ..flow._results import raise_if, RESULTS
 from ..flow._solution import Solution
 from ..flow._solve import solve
-from ..system._model import ModeState, SwitchedSystem
+from ..system._mode import ModeState
+from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, System
 from ._saltation import saltation_matrices, states
 

@@ -17,8 +17,11 @@ from .._types import Scalar, StateT, Y
 from ..derivatives._floquet import eigenvalues
 from ..flow._results import outcomes, RESULTS
 from ..orbits._orbit import ravel
-from ..system._model import ModeState, SwitchedSystem
-from ..system._system import impact, relay, System
+from ..system._impact import impact
+from ..system._mode import ModeState
+from ..system._model import SwitchedSystem
+from ..system._relay import relay
+from ..system._system import System
 
 
 @shown
@@ -162,11 +165,10 @@ def _with(model: SwitchedSystem, system: System) -> SwitchedSystem:
 
 def nearest_state(model: SwitchedSystem, t: Scalar, y: Y, mode: tuple) -> ModeState:
     """The mode, with the component of h nearest to zero where h < 0 or on it, and its least one elsewhere."""
-    parts = []
-    for k, switch in enumerate(model.switches):
-        one = model.parts[k] == 1 or isinstance(switch, relay)
-        parts.append(None if one else jnp.argmin(jnp.stack(model.h(k, t, y))).astype(jnp.int32))
-    return ModeState(mode, tuple(parts), tuple(jnp.zeros((), jnp.int32) for _ in mode))
+    parts = [
+        None if n == 1 else jnp.argmin(jnp.stack(model.h(k, t, y))).astype(jnp.int32) for k, n in enumerate(model.parts)
+    ]
+    return ModeState.of(mode, parts)
 
 
 def _surface(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
@@ -230,8 +232,7 @@ def _place(
     for k, switch in enumerate(model.switches):
         mode = state.mode[k]
         if isinstance(switch, relay):
-            on, off = switch.guard(model.system, t, y), switch.off_guard(model.system, t, y)
-            admissible = admissible & (jnp.where(mode == 1, off, on) <= 0)
+            admissible = admissible & (switch.rising(model.system, t, y, mode) <= 0)
             continue
         parts = jnp.stack(model.h(k, t, y))
         h, slack = jnp.min(parts), 1e3 * jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y)) + 1e-9

@@ -15,8 +15,11 @@ from .._types import StateT, Y
 from ..flow._arguments import check_solve
 from ..flow._results import raise_if, RESULTS
 from ..orbits._orbit import ravel
+from ..system._clock import clock
+from ..system._impact import impact
 from ..system._model import SwitchedSystem
-from ..system._system import arrays_of, clock, impact, sgn, System
+from ..system._sgn import sgn
+from ..system._system import arrays_of, System
 from ._equilibrium import Equilibrium, equilibrium_in
 
 

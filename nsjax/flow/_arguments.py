@@ -14,7 +14,7 @@ from jax.core import Tracer
 from .._numerics._text import components, did_you_mean, known
 from .._types import Scalar, Y
 from ..system._checks import check_direction, check_fields, check_parameters, check_system
-from ..system._system import clock, sgn, System
+from ..system._system import System
 from ._save import in_order
 from .steppers._exponential import Exponential
 
@@ -189,8 +189,8 @@ def _given(system: System, mode: Any) -> dict[str, Any]:
                 f"Argument `mode` must name switches of the system ({names}), but got `{name}`."
                 + did_you_mean(str(name), switches)
             )
-        allowed = (-1, 0, 1) if isinstance(switches[name], sgn) else (0, 1)
-        if isinstance(switches[name], clock):
+        allowed = tuple(sorted(switches[name].modes))
+        if not allowed:
             continue
         traced = isinstance(value, Tracer)
         whole = traced or (eqx.is_array_like(value) and jnp.issubdtype(jnp.result_type(value), jnp.integer))

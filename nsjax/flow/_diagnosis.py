@@ -13,8 +13,8 @@ import numpy as np
 from .._numerics._text import components, written
 from .._types import Y
 from ..system._checks import closing_contacts
-from ..system._model import ModeState, SwitchedSystem
-from ..system._system import clock, impact, relay
+from ..system._mode import ModeState
+from ..system._model import SwitchedSystem
 from ._results import RESULTS
 from ._solution import Solution
 
@@ -53,21 +53,14 @@ def _pieces(system: Any, t: Any, y: Y, mode: Any) -> list[tuple[str, list[tuple[
     """What the model's methods return, named."""
     owner, out = type(system).__name__, []
     model = SwitchedSystem(system, jnp.ones_like(t), t, y)
-    zero = jnp.zeros((), jnp.int32)
-    parts = tuple(zero if n > 1 else None for n in model.parts)
-    state = ModeState(tuple(mode), parts, tuple(zero for _ in model.switches))
+    state = ModeState.of(mode, [jnp.zeros((), jnp.int32) if n > 1 else None for n in model.parts])
     model = model.within(state.mode)
-    for k, switch in enumerate(model.switches):
-        if isinstance(switch, clock):
-            continue
-        if isinstance(switch, relay):
-            h = switch.guard(system, model.time(t), y), switch.off_guard(system, model.time(t), y)
-        else:
-            h = model.h(k, t, y)
-        out.append((f"`{owner}.{switch.name}`", [("h", value) for value in h]))
+    for switch in model.switches:
+        h = switch.surfaces(system, model.time(t), y)
+        if h:
+            out.append((f"`{owner}.{switch.name}`", [("h", value) for value in h]))
     signs = tuple(
-        x if isinstance(switch, impact) else jnp.where(x == 0, 1, x)
-        for switch, x in zip(model.switches, model.signs(t, state))
+        jnp.where(x == 0, 1, x) if switch.order == 1 else x for switch, x in zip(model.switches, model.signs(t, state))
     )
     return [*out, (f"`{owner}.vector_field`", components(model.field(t, y, signs)))]
 

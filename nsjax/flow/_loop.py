@@ -18,12 +18,13 @@ from .._numerics._autodiff import frozen
 from .._numerics._barrier import once
 from .._numerics._lane_cond import compact_cond
 from .._types import Scalar, Y
-from ..system._model import BEYOND, ModeState, SwitchedSystem
-from ..system._system import impact
+from ..system._mode import BEYOND, ModeState
+from ..system._model import SwitchedSystem
 from ._results import RESULTS
 from ._save import Log, Saved
 from .events._attraction import escapes
-from .events._transition import land, Landing
+from .events._locate import Interval
+from .events._transition import Transition, transition
 from .steppers._stepper import stack, Step, Stepper, unresolved, Watch
 
 
@@ -87,17 +88,13 @@ class Flow(eqx.Module):
         """Relative and absolute, of a step; not numbers for steps of a given length."""
         return getattr(self.controller, "rtol", jnp.nan), getattr(self.controller, "atol", jnp.nan)
 
-    def land(
-        self, t: Scalar, t_next: Scalar, y: Y, f: Y, state: ModeState, coefficients: list, noise: list, touches: list
-    ) -> Landing:
+    def land(self, step: Interval, touches: list) -> Transition:
         """The step once more, to its first event."""
-        model = self.model.within(state.mode)
-        *first, last = once(self.stepper.scaled(model, lax.stop_gradient(coefficients)))
+        model = self.model.within(step.state.mode)
+        *first, last = once(self.stepper.scaled(model, step.polynomials))
         polynomials = [*first, jnp.where(model.stacked(touches, False), jnp.minimum(last, 0), last)]
-        noises = model.stacked(lax.stop_gradient(noise), 0.0)
-        return land(
-            model, self.stepper, self.tolerance, self.want_points, self.t0, t, t_next, y, f, state, polynomials, noises
-        )
+        step = step._replace(polynomials=polynomials, noise=model.stacked(step.noise, 0.0))
+        return transition(model, self.stepper, self.tolerance, self.want_points, self.t0, step)
 
     def attempt(self, c: Carry) -> _Attempt:
         """A step of the solver, its error against the tolerance, and whether a guard may have a root on it."""
@@ -210,14 +207,14 @@ class Flow(eqx.Module):
         rows = [ft.reduce(jnp.maximum, map(self.stepper.least, row, roots)) for row, roots in zip(guards, known)]
         return once(ft.reduce(jnp.minimum, rows) + 0 * sum(c for row in guards for part in row for c in part))
 
-    def arrive(self, c: Carry, attempt: _Attempt) -> Landing:
+    def arrive(self, c: Carry, attempt: _Attempt) -> Transition:
         """Where the step leads: to its end, or to the first event on it."""
         model = self.model.within(c.state.mode)
         step = attempt.step
         t, no = step.t_next, jnp.zeros((), bool)
         y_end = model.project(t, step.y1, c.state)
         points = stack(self.stepper.points(c.y, step.y1, step.ks)) if self.want_points else None
-        end = Landing(
+        end = Transition(
             found=no,
             t=t,
             t_after=t,
@@ -237,9 +234,8 @@ class Flow(eqx.Module):
         )
         if not model.slots:
             return end
-        here = (c.t, t, c.y, c.f, c.state, lax.stop_gradient(step.guards), lax.stop_gradient(step.noise))
-        here = (*here, attempt.touches)
-        there = _landed(attempt.busy, self, here, end)
+        here = Interval(c.t, t, c.y, c.f, c.state, lax.stop_gradient(step.guards), lax.stop_gradient(step.noise))
+        there = _landed(attempt.busy, self, (here, attempt.touches), end)
         # A lane that looked for a root may have found none.
         event = attempt.busy & there.found
         near = jnp.where(attempt.busy, there.margin, jnp.inf)
@@ -307,18 +303,18 @@ class Flow(eqx.Module):
             meter=self.meter.step(c.meter, jnp.where(active, (t - self.t0) / (self.t1 - self.t0), 1.0)),
         )
 
-    def ends(self, there: Landing) -> Bool[Array, ""]:
+    def ends(self, there: Transition) -> Bool[Array, ""]:
         """Whether an event is one that ends the solution: of an impact, that is not a lift-off."""
         last = jnp.zeros((), bool)
         for i, slot in enumerate(self.model.slots):
             switch = self.model.switches[slot.switch]
-            if switch.ends and not (slot.holding and isinstance(switch, impact)):
+            if switch.ends and not (slot.holding and slot.switch in self.model.contacts):
                 mode = there.state.mode[slot.switch]
                 wanted = jnp.stack([mode == value for value in switch.ends]).any()
                 last = last | ((there.slot == i) & wanted)
         return last
 
-    def save(self, c: Carry, there: Landing, moved: Bool[Array, ""], accepted: Int[Array, ""]) -> Saved:
+    def save(self, c: Carry, there: Transition, moved: Bool[Array, ""], accepted: Int[Array, ""]) -> Saved:
         """What `saveat` asks for of this turn; at an event the states before and after it."""
         system, direction = self.model.system, self.model.direction
         saved = c.saved
@@ -378,7 +374,7 @@ def finite(tree: Any) -> Bool[Array, ""]:
     return once(sum(jnp.sum(0 * x) for x in jax.tree.leaves(tree))) == 0
 
 
-def _landed(pred: Any, flow: Flow, here: tuple, default: Landing) -> Landing:
+def _landed(pred: Any, flow: Flow, here: tuple, default: Transition) -> Transition:
     """`flow.land(*here)` for lanes with work to do, else `default`."""
     dynamic, static = eqx.partition((flow, here), eqx.is_array)
     dynamic_default, static_default = eqx.partition(default, eqx.is_array)

@@ -17,8 +17,9 @@ from .._numerics._autodiff import dense_jacobian, forward_only, frozen
 from .._numerics._jaxpr import is_affine, may_jump
 from .._numerics._text import known, suggesting
 from .._types import Scalar, StateT, Y
-from ..system._checks import check_model, closing_contacts, laws
-from ..system._model import ModeState, SwitchedSystem
+from ..system._checks import check_model, closing_contacts
+from ..system._mode import ModeState
+from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, System
 from ._arguments import check_numbers, check_solve
 from ._diagnosis import explain
@@ -109,7 +110,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         jumpy=jumpy,
         reverse=reverse,
     )
-    for _, _, good, _ in [law for switch in model.switches for law in laws(system, switch)]:
+    for _, _, good, _ in [law for switch in model.switches for law in switch.laws(system)]:
         result = RESULTS.where(good, result, RESULTS.wrong_parameter)
     for t in (t0, t1) if model.clocks else ():
         result = RESULTS.where(model.countable(t), result, RESULTS.clock_too_fast)

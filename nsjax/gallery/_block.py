@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Number, Scalar
-from ..system._system import sgn, SwitchValues, System
+from ..system._sgn import sgn
+from ..system._system import SwitchValues, System
 from ._friction import falling
 
 

@@ -3,7 +3,8 @@
 from typing import NamedTuple
 
 from .._types import Number, Scalar
-from ..system._system import sgn, SwitchValues, System
+from ..system._sgn import sgn
+from ..system._system import SwitchValues, System
 
 
 class Line(NamedTuple):

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from .._types import Number, Scalar
-from ..system._system import sgn, SwitchValues, System
+from ..system._sgn import sgn
+from ..system._system import SwitchValues, System
 from ._examples import Line, Plane
 
 

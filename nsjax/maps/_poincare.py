@@ -25,8 +25,13 @@ from ..flow._results import is_okay, outcomes, raise_if, RESULTS
 from ..flow._solve import solve
 from ..flow.events._initial_mode import AT_ONCE, start_mode
 from ..system._checks import check_model, check_system
-from ..system._model import ModeState, SwitchedSystem
-from ..system._system import AbstractSwitch, arrays_of, clock, forwarded, impact, relay, sgn, SwitchValues, System
+from ..system._clock import clock
+from ..system._impact import impact
+from ..system._mode import ModeState
+from ..system._model import SwitchedSystem
+from ..system._sgn import sgn
+from ..system._switch import AbstractSwitch, forwarded
+from ..system._system import arrays_of, SwitchValues, System
 
 
 PERIODS = 100  # of the forcing in which a solution is expected to return
@@ -89,7 +94,7 @@ class _Watched(System):
     def switches(self) -> tuple[AbstractSwitch, ...]:
         if self.section is None:
             return tuple(
-                _ending(k, _ends(k, self.direction)) if k.name == self.name else forwarded(k)
+                _ending(k, k.modes_after(self.direction)) if k.name == self.name else forwarded(k)
                 for k in self.system.switches
             )
         ends = (self.direction,) if self.direction else (1, -1)
@@ -102,15 +107,6 @@ class _Watched(System):
     @property
     def period(self) -> Float[Array, ""] | float | None:
         return self.system.period
-
-
-def _ends(switch: AbstractSwitch, direction: int) -> tuple[int, ...]:
-    """The modes to which an event of this switch leads, if it is one of the section."""
-    if isinstance(switch, sgn):
-        return (direction,) if direction else (1, 0, -1)
-    if isinstance(switch, relay):
-        return ((1 + direction) // 2,) if direction else (1, 0)
-    return (1, 0)
 
 
 class Start(NamedTuple):

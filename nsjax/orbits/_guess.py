@@ -16,8 +16,11 @@ from ..derivatives._saltation import states
 from ..derivatives._variational import arcs
 from ..flow._results import is_okay, RESULTS
 from ..flow._solve import solve
+from ..system._clock import clock
 from ..system._model import SwitchedSystem
-from ..system._system import clock, relay, sgn, System
+from ..system._relay import relay
+from ..system._sgn import sgn
+from ..system._system import System
 from ._orbit import distance, ravel
 
 
@@ -64,7 +67,8 @@ def of_relays(system: System, mode: Any) -> Relays:
 def undecided(system: System, t0: Scalar, y0: Y) -> dict[str, Bool[Array, ""]]:
     """Which relays are within their hysteresis."""
     relays = [k for k in system.switches if isinstance(k, relay)]
-    return {k.name: (k.guard(system, t0, y0) <= 0) & (k.off_guard(system, t0, y0) <= 0) for k in relays}
+    surfaces = {k.name: k.surfaces(system, t0, y0) for k in relays}
+    return {name: (on <= 0) & (off <= 0) for name, (on, off) in surfaces.items()}
 
 
 def at_start(model: SwitchedSystem, t: Scalar, y: Y, given: Relays = None) -> Any:
@@ -78,9 +82,8 @@ def at_start(model: SwitchedSystem, t: Scalar, y: Y, given: Relays = None) -> An
             noise = jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y))
             zero = jnp.where(jnp.abs(h) <= 1e3 * noise, 0, jnp.sign(h)).astype(jnp.int32)
         elif isinstance(switch, relay):
-            on, off = (h(model.system, t, y) > 0 for h in (switch.guard, switch.off_guard))
-            zero = jnp.asarray((given or {}).get(switch.name, zero), jnp.int32)
-            zero = jnp.where(on, 1, jnp.where(off, 0, zero))
+            before = jnp.asarray((given or {}).get(switch.name, zero), jnp.int32)
+            zero = switch.mode_at(model.system, t, y, before)
         elif isinstance(switch, clock):
             zero = model.counts(t)[k]
         modes.append(zero)

@@ -20,7 +20,8 @@ from ..flow._results import is_okay, RESULTS
 from ..flow._solution import Events
 from ..flow._solve import solve
 from ..system._model import SwitchedSystem
-from ..system._system import relay, System
+from ..system._relay import relay
+from ..system._system import System
 from ._guess import at_start, base_point
 from ._orbit import distance, fractions, judge, Orbit, ravel
 from .segments._arcs import Arcs

@@ -11,7 +11,11 @@ from .._numerics._jaxpr import is_constant
 from .._types import Y
 from ..flow._solution import Solution
 from ..orbits._orbit import Orbit
-from ..system._system import AbstractSwitch, clock, impact, relay, sgn
+from ..system._clock import clock
+from ..system._impact import impact
+from ..system._relay import relay
+from ..system._sgn import sgn
+from ..system._switch import AbstractSwitch
 from ._path import arcs, chosen, components, solved
 from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_legend, mode_line
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, TYPE_CHECKING
 
-from ..system._system import clock, impact, relay, System
+from ..system._system import System
 
 
 if TYPE_CHECKING:
@@ -28,18 +28,11 @@ def mode_line(system: System, mode: tuple[int, ...]) -> dict[str, Any]:
     while it slides."""
     number, words, slides = 0, [], False
     for k, (switch, value) in enumerate(zip(system.switches, mode)):
-        if isinstance(switch, impact):
-            words += [f"{switch.name}: rests"] * (value != 0)
-        elif isinstance(switch, relay):
-            words.append(f"{switch.name} {'on' if value else 'off'}")
-        elif isinstance(switch, clock):
-            value = 0  # each tick another mode: no line for each
-        else:
-            words.append(f"{switch.name} {('= 0, slides', '> 0', '< 0')[value]}")
-            slides |= value == 0
-            value = {-1: 0, 1: 1, 0: 2}[value]
-        number += 3**k * value
-    return dict(color=f"C{number % 10}", linewidth=3.5 if slides else 1.5, label="; ".join(words) or None)
+        words.append(switch.words(value))
+        slides |= switch.order == 1 and value == switch.holding
+        if switch.modes:  # each tick of a clock is another mode: no line for each
+            number += 3**k * switch.modes.index(value)
+    return dict(color=f"C{number % 10}", linewidth=3.5 if slides else 1.5, label="; ".join(filter(None, words)) or None)
 
 
 def axis_label(labels: Labels, name: Any, default: str | None = None) -> str:

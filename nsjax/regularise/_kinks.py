@@ -22,7 +22,9 @@ from .._numerics._jaxpr import is_affine, is_constant
 from .._numerics._series import _CALLS
 from .._types import Scalar, Y
 from ..flow._arguments import check_solve
-from ..system._system import AbstractSwitch, arrays_of, forwarded, sgn, SwitchValues, System
+from ..system._sgn import sgn
+from ..system._switch import AbstractSwitch, forwarded
+from ..system._system import arrays_of, SwitchValues, System
 
 
 _KINKS: dict[str, Callable[..., Any]] = {"abs": jnp.abs, "max": jnp.maximum, "min": jnp.minimum, "clamp": lax.clamp}

@@ -20,8 +20,11 @@ from .._numerics._jaxpr import is_constant
 from .._numerics._series import Series
 from .._types import Scalar, Y
 from ..system._checks import check_model, check_system
-from ..system._model import ModeState, SwitchedSystem
-from ..system._system import AbstractSwitch, arrays_of, forwarded, sgn, SwitchValues, System
+from ..system._mode import ModeState
+from ..system._model import SwitchedSystem
+from ..system._sgn import sgn
+from ..system._switch import AbstractSwitch, forwarded
+from ..system._system import arrays_of, SwitchValues, System
 
 
 _TERMS = 8  # of the series in `_quotient`

@@ -15,7 +15,8 @@ from .._types import Y
 from ..flow._arguments import check_solve
 from ..system._model import SwitchedSystem
 from ..system._parameter import get_parameter, parameter_path, put_parameter
-from ..system._system import arrays_of, sgn, System
+from ..system._sgn import sgn
+from ..system._system import arrays_of, System
 
 
 LARGE = 4  # rows of a matrix that is not printed in full

@@ -1,3 +1,7 @@
 """What a user writes: the vector field and its switches; and what the library makes of it, the field in each mode."""
 
-from ._system import clock as clock, impact as impact, relay as relay, sgn as sgn, System as System
+from ._clock import clock as clock
+from ._impact import impact as impact
+from ._relay import relay as relay
+from ._sgn import sgn as sgn
+from ._system import System as System

@@ -8,7 +8,7 @@ being held on m surfaces at once solves m equations for the m multipliers, n_i .
 """
 
 import functools as ft
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,61 +21,27 @@ from jaxtyping import Array, Bool, Float, Int
 from .._numerics._autodiff import frozen
 from .._numerics._jaxpr import dependence, is_affine, is_constant
 from .._numerics._linalg import linear_solve, parallel
-from .._types import Mode, Scalar, Y
-from ._system import AbstractSwitch, clock, impact, relay, sgn, System
+from .._types import Scalar, Y
+from ._clocked import Clocked
+from ._mode import BEYOND, ModeState, pick, Slot
+from ._system import System
 
 
-BEYOND = 4  # added, with its sign, to the roots of a switch that is held with |λ| > 1 in backward time
-
-
-class Slot(NamedTuple):
-    """One guard: a function that is positive while the mode lasts."""
-
-    switch: int  # position of its switch
-    part: int  # component of h, or the sign of the bound that λ reaches
-    holding: bool  # whether it watches λ
-
-
-class ModeState(NamedTuple):
-    """A mode, with the component of h that is active on the surface of each switch (None for a smooth surface) and
-    the number of roots at the present instant, to be left out when the next one is sought; of a switch that is held the
-    sign of the bound that its value is at, or 0, and see `SwitchedSystem.edge`."""
-
-    mode: Mode
-    part: tuple[Int[Array, ""] | None, ...]
-    roots: tuple[Int[Array, ""], ...]
-
-
-def _pick(values: tuple[Any, ...], index: Any) -> Any:
-    if index is None or len(values) == 1:
-        return values[0]
-    return jnp.stack(values)[index]
-
-
-class SwitchedSystem(eqx.Module):
+class SwitchedSystem(Clocked):
     """A system as the flow sees it: time multiplied by `direction` so that it always increases, and the structure of
     its switches worked out once while tracing."""
 
-    system: System
-    direction: Any  # +1 or -1
-    switches: tuple[AbstractSwitch, ...] = eqx.field(static=True)
     parts: tuple[int, ...] = eqx.field(static=True)  # number of components of h, per switch
     holdable: tuple[int, ...] = eqx.field(static=True)  # switches whose value can hold the solution on their surface
     contacts: tuple[int, ...] = eqx.field(static=True)  # the impacts among them
-    clocks: tuple[int, ...] = eqx.field(static=True)  # switches that tick
     jointly_affine: bool = eqx.field(static=True)
     steady: bool = eqx.field(static=True)  # whether what acts on a surface that can be slid on is constant
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # of `holdable`: whose surfaces may coincide
     slots: tuple[Slot, ...] = eqx.field(static=True)
-    window: tuple[Scalar, Scalar] | None  # the ticks between which time is kept
 
     def __init__(self, system: System, direction: Any, t: Scalar, y: Y):
-        self.system = system
-        self.direction = direction
-        self.window = None
-        self.switches = system.switches
+        super().__init__(system, direction)
         self.parts = tuple(len(k.components(system, t, y)) for k in self.switches)
-        self.clocks = tuple(k for k, switch in enumerate(self.switches) if isinstance(switch, clock))
         zeros = tuple(jnp.zeros((), jnp.result_type(t)) for _ in self.switches)
         one = jnp.ones_like(t)
 
@@ -89,14 +55,14 @@ class SwitchedSystem(eqx.Module):
             return not is_constant(lambda sk: fn(zeros[:k] + (sk,) + zeros[k + 1 :]), zeros[k])
 
         def holds(k: int) -> bool:
-            if isinstance(self.switches[k], sgn):
+            if self.switches[k].order == 1:
                 return acts(lambda s: rate(k, t, y, s), k)
             # A contact force that acts on velocities, and so on d²h/dt²; the corner of two walls cannot hold.
-            smooth = isinstance(self.switches[k], impact) and self.parts[k] == 1
+            smooth = self.switches[k].order == 2 and self.parts[k] == 1
             return smooth and is_constant(lambda s: rate(k, t, y, s), zeros) and acts(lambda s: second(k, s), k)
 
         self.holdable = tuple(k for k in range(len(self.switches)) if holds(k))
-        self.contacts = tuple(k for k in self.holdable if isinstance(self.switches[k], impact))
+        self.contacts = tuple(k for k in self.holdable if self.switches[k].order == 2)
         self.jointly_affine = is_affine(lambda s: self.field(t, y, s), zeros)
         dry = [k for k in self.holdable if k not in self.contacts]
 
@@ -122,87 +88,11 @@ class SwitchedSystem(eqx.Module):
                 if (seen[i] & seen[j]).any()
             )
         slots = []
-        for k, switch in enumerate(self.switches):
-            number = 1 if isinstance(switch, relay) else self.parts[k]
+        for k, number in enumerate(self.parts):
             slots += [Slot(k, part, False) for part in range(number)]
             if k in self.holdable:
                 slots += [Slot(k, sign, True) for sign in ((1,) if k in self.contacts else (1, -1))]
         self.slots = tuple(slots)
-
-    # Time, which is kept between the ticks of the clocks: at a tick functions of it are taken from the mode's side.
-
-    def within(self, mode: Mode) -> "SwitchedSystem":
-        """The same for a mode, that tells between which ticks it is."""
-        if not self.clocks:
-            return self
-        spans = [self.span(k, mode) for k in self.clocks]
-        low, high = (ft.reduce(pick, ends) for pick, ends in zip((jnp.maximum, jnp.minimum), zip(*spans)))
-        return eqx.tree_at(
-            lambda m: m.window, self, frozen((low, high)), is_leaf=lambda x: x is None or x is self.window
-        )
-
-    def at(self, t: Scalar) -> "SwitchedSystem":
-        """The same for what sets out at time `t`."""
-        zero, counts = jnp.zeros((), jnp.int32), self.counts(t)
-        return self.within(tuple(counts.get(k, zero) for k in range(len(self.switches))))
-
-    def _in(self, state: ModeState) -> "SwitchedSystem":
-        return self if self.window is not None else self.within(state.mode)
-
-    def span(self, k: int, mode: Mode) -> tuple[Scalar, Scalar]:
-        """The last and the next tick of clock k, in the time of the user."""
-        switch = self.switches[k]
-        assert isinstance(switch, clock)
-        return switch.span(self.system, mode[k], jnp.ones((), jnp.result_type(self.direction)))
-
-    def countable(self, t: Scalar) -> Bool[Array, ""]:
-        """Whether the ticks of all clocks can be told apart and counted up to `t`, in the time of the user."""
-        good = jnp.ones((), bool)
-        for k in self.clocks:
-            switch = self.switches[k]
-            assert isinstance(switch, clock)
-            good = good & switch.countable(self.system, t)
-        return good
-
-    def counts(self, t: Scalar) -> dict[int, Int[Array, ""]]:
-        """How often each clock has ticked."""
-        passed = {}
-        for k in self.clocks:
-            switch = self.switches[k]
-            assert isinstance(switch, clock)
-            passed[k] = switch.count(self.system, frozen(t * self.direction), self.direction > 0)
-        return passed
-
-    def tick(self, k: int, mode: Mode) -> Scalar:
-        """When time, increasing as the flow sees it, meets the next tick of clock k."""
-        low, high = self.span(k, mode)
-        return jnp.where(self.direction > 0, high, -low)
-
-    def next_tick(self, mode: Mode) -> Scalar:
-        """The same of the clock that ticks first."""
-        return ft.reduce(jnp.minimum, [self.tick(k, mode) for k in self.clocks])
-
-    def time(self, t: Scalar) -> Scalar:
-        """The time of the user, kept between the ticks of the mode.
-
-        As near to a tick as rounding takes it (and `t % T` or `floor(t / T)` with it) it is put on the right side;
-        beyond, where only a search that has not converged yet goes, it stands still. (By comparisons: to a power series
-        in t a shift is a number, but a maximum of t and the tick is the one or the other.)
-        """
-        t = t * self.direction
-        if self.window is None:
-            return t
-        (low, high), margin = self.window, self.margin(t)
-        shift = jnp.where(t < low + margin, 2 * margin, 0) - jnp.where(t > high - margin, 2 * margin, 0)
-        kept = jnp.where(t < low - margin, low + margin, t + shift)
-        return jnp.where(t > high + margin, high - margin, kept)
-
-    def margin(self, t: Scalar) -> Scalar:
-        """How near to a tick time is within rounding of it; there it is shifted by twice as much."""
-        assert self.window is not None
-        ends = (*self.window, frozen(t))
-        size = ft.reduce(jnp.maximum, [jnp.where(jnp.isfinite(x), jnp.abs(x), 0) for x in ends])
-        return 100 * float(jnp.finfo(t.dtype).eps) * size + float(jnp.finfo(t.dtype).tiny) ** 0.75
 
     # The smooth field for given switch values, and the indicator functions.
 
@@ -214,14 +104,11 @@ class SwitchedSystem(eqx.Module):
         return self.switches[k].components(self.system, self.time(t), y)
 
     def bound(self, k: int) -> Any:
-        switch = self.switches[k]
-        assert isinstance(switch, sgn)
-        return switch.bound(self.system)
+        return self.switches[k].bound(self.system)
 
     def static(self, k: int) -> bool:
         """Whether switch k has a static friction point, so that it holds beyond |λ| = 1."""
-        switch = self.switches[k]
-        return isinstance(switch, sgn) and switch.breakaway_fn is not None
+        return self.switches[k].static
 
     def edge(self, k: int, value: Scalar, slack: float) -> Int[Array, ""]:
         """The sign of the bound that the value of a held `sgn` switch is at, or 0.
@@ -237,7 +124,7 @@ class SwitchedSystem(eqx.Module):
 
     def held(self, k: int, mode: Any) -> Bool[Array, ""]:
         """Whether `mode` of switch k holds the solution on its surface."""
-        return mode == (1 if k in self.contacts else 0)
+        return mode == self.switches[k].holding
 
     def holds(self, mode: Any) -> bool:
         """Whether one of its switches does; of a mode that is known."""
@@ -248,7 +135,7 @@ class SwitchedSystem(eqx.Module):
         self = self._in(state)
 
         def h(t: Scalar, y: Y) -> Scalar:
-            return _pick(self.h(k, t, y), state.part[k])
+            return pick(self.h(k, t, y), state.part[k])
 
         if k not in self.contacts:
             return h(t, y)
@@ -268,14 +155,11 @@ class SwitchedSystem(eqx.Module):
         """dh/dt of switch k along the flow (the active component of h)."""
         self = self._in(state)
         f = self.flow(t, y, state)
-        return jax.jvp(lambda t, y: _pick(self.h(k, t, y), state.part[k]), (t, y), (jnp.ones_like(t), f))[1]
+        return jax.jvp(lambda t, y: pick(self.h(k, t, y), state.part[k]), (t, y), (jnp.ones_like(t), f))[1]
 
     def signs(self, t: Scalar, state: ModeState) -> tuple[Any, ...]:
         """Switch values of a mode, with 0 for those which are held, and for contacts."""
-        return tuple(
-            jnp.zeros((), t.dtype) if isinstance(switch, impact) else m.astype(t.dtype)
-            for switch, m in zip(self.switches, state.mode)
-        )
+        return tuple(switch.value(m, t.dtype) for switch, m in zip(self.switches, state.mode))
 
     def linear(self, t: Scalar, y: Y, state: ModeState, s: tuple) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
         """Rates of the holdable surfaces at `s`, and their derivatives with respect to the holdable values."""
@@ -425,7 +309,6 @@ class SwitchedSystem(eqx.Module):
         """`guards[slot][part]` (of the slots that are `wanted`, else empty), as scalars: stacked arrays of two or
         five cost XLA's CPU code several times as much. `s`: the values of the switches, if they are known."""
         self = self._in(state)
-        one = jnp.ones((), t.dtype)
         wanted = (True,) * len(self.slots) if wanted is None else wanted
         if s is None:
             s = self.values(t, y, state) if any(w and slot.holding for w, slot in zip(wanted, self.slots)) else ()
@@ -434,29 +317,12 @@ class SwitchedSystem(eqx.Module):
             if not want:
                 rows.append([])
                 continue
-            k, switch, mode = slot.switch, self.switches[slot.switch], state.mode[slot.switch]
+            k = slot.switch
             if slot.holding:
-                left = s[k] if k in self.contacts else self.bound(k) - slot.part * s[k]
-                if self.static(k):
-                    left = jnp.where(state.roots[k] * slot.part <= -BEYOND, -slot.part * s[k] - 1, left)
-                row = [jnp.where(self.held(k, mode), left, one)]
-            elif isinstance(switch, relay):
-                on = switch.guard(self.system, self.time(t), y)
-                off = switch.off_guard(self.system, self.time(t), y)
-                row = [-jnp.where(mode == 1, off, on)]
-            elif isinstance(switch, clock):
-                low, high = self.span(k, state.mode)
-                left = jnp.where(self.direction > 0, high - t * self.direction, t * self.direction - low)
-                there = jnp.isfinite(jnp.where(self.direction > 0, high, low))
-                row = [jnp.where(there, left, one)]
-            elif isinstance(switch, impact):
-                gap = self.h(k, t, y)[slot.part]
-                row = [jnp.where(mode == 1, one, gap) if k in self.contacts else gap]
-            elif self.parts[k] == 1:
-                row = [jnp.where(mode == 0, one, mode.astype(t.dtype) * self.h(k, t, y)[0])]
+                left = self.switches[k].bound_guard(self, slot, s[k], state)
+                rows.append([jnp.where(self.held(k, state.mode[k]), left, jnp.ones((), t.dtype))])
             else:
-                row = self._corner_guard(slot, t, y, state)
-            rows.append(row)
+                rows.append(self.switches[k].guard_row(self, slot, t, y, state))
         return rows
 
     def stacked(self, rows: list[list[Any]], filler: float) -> Array:
@@ -464,40 +330,20 @@ class SwitchedSystem(eqx.Module):
         like = jnp.full_like(rows[0][0], filler)
         return jnp.stack([jnp.stack(row + [like] * (self.width - len(row))) for row in rows])
 
-    def _corner_guard(self, slot: Slot, t: Scalar, y: Y, state: ModeState) -> list[Scalar]:
-        """h = min(h_1, ..., h_J). Where h > 0 each component is watched alone; where h < 0 the event is the instant at
-        which the last of them becomes positive; while sliding on one, the others end the surface at its tip."""
-        k, j = slot.switch, slot.part
-        h, mode, part = self.h(k, t, y), state.mode[k], state.part[k]
-        one = jnp.ones((), t.dtype)
-        alone = jnp.where((mode == 0) & (part == j), one, h[j])
-        if j == 0:
-            return [jnp.where(mode < 0, -h[0], alone)] + [jnp.where(mode < 0, -hi, -one) for hi in h[1:]]
-        return [jnp.where(mode < 0, one, alone)]
-
     def known_roots(self, state: ModeState) -> list[list[Int[Array, ""]]]:
         """How many roots each guard has at the present instant (just left, so not to be found again)."""
         rows = []
-        none = jnp.zeros((), jnp.int32)
-        for k, j, holding in self.slots:
-            roots, mode, part = state.roots[k], state.mode[k], state.part[k]
-            if k in self.holdable:
-                held = self.held(k, mode)
-                if holding:
-                    at = (roots == j) | (roots == j * (BEYOND + 1)) if self.static(k) else roots == j
-                    rows.append([jnp.where(held & at, 1, none)])
-                    continue
-                roots = jnp.where(held, none, roots)
-            if part is None:
-                row = [roots]
-            elif isinstance(self.switches[k], impact):
-                row = [jnp.where(part == j, roots, none)]
-            elif j == 0:
-                row = [jnp.where((part == 0) | (mode < 0) & (part == i), roots, none) for i in range(self.parts[k])]
-                row[1:] = [jnp.where(mode < 0, r, none) for r in row[1:]]
-            else:
-                row = [jnp.where((mode >= 0) & (part == j), roots, none)]
-            rows.append(row)
+        for slot in self.slots:
+            k, none = slot.switch, jnp.zeros((), jnp.int32)
+            roots, held = state.roots[k], self.held(k, state.mode[k])
+            if slot.holding:
+                at = roots == slot.part
+                if self.static(k):
+                    at = at | (roots == slot.part * (BEYOND + 1))
+                rows.append([jnp.where(held & at, 1, none)])
+                continue
+            roots = jnp.where(held, none, roots) if k in self.holdable else roots
+            rows.append(self.switches[k].known_row(self, slot, roots, state))
         return rows
 
     def sizes(self, fn: Any, t: Scalar, y: Y, dt: Scalar, dy: Y) -> Array:

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 import nsjax
 from nsjax import gallery
-from nsjax.system._system import impact
+from nsjax.system._impact import impact
 
 
 KEYS = tuple(gallery.THESIS)

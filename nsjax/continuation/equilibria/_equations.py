@@ -19,9 +19,11 @@ from ...equilibria._equilibrium import (
     stacked_values,
     switch_values,
 )
-from ...system._model import ModeState, SwitchedSystem
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 from ...system._parameter import put_parameter
-from ...system._system import impact, relay, sgn
+from ...system._relay import relay
+from ...system._sgn import sgn
 from ._corrector import Curve
 
 
@@ -66,9 +68,7 @@ class EquilibriumCurve(Curve):
         return eqx.tree_at(lambda m: m.system, self.model, system), jfu.ravel_pytree(self.like)[1](x), sigma
 
     def state(self, mode: Int[Array, "2 switches"]) -> ModeState:
-        several = [n > 1 and not isinstance(k, relay) for n, k in zip(self.model.parts, self.model.switches)]
-        part = tuple(p if on else None for p, on in zip(mode[1], several))
-        return ModeState(tuple(mode[0]), part, tuple(jnp.zeros_like(m) for m in mode[0]))
+        return ModeState.of(mode[0], [p if n > 1 else None for p, n in zip(mode[1], self.model.parts)])
 
     def residual(self, u: Array, mode: Array) -> Array:
         model, y, sigma = self.at(u)
@@ -96,7 +96,7 @@ class EquilibriumCurve(Curve):
         rows: list[Any] = []
         for k, switch in enumerate(model.switches):
             if isinstance(switch, relay):
-                rows += [switch.guard(model.system, self.t, y), switch.off_guard(model.system, self.t, y)]
+                rows += switch.surfaces(model.system, self.t, y)
                 continue
             h = model.h(k, self.t, y)
             rows += [*h, jnp.min(jnp.stack(h))] if len(h) > 1 else h
@@ -176,7 +176,7 @@ class EquilibriumCurve(Curve):
         n = len(u) - 1 - len(self.model.holdable)
         for i, k in enumerate(self.model.holdable):
             if not self.model.held(k, mode[0, k]):
-                value = 0.0 if isinstance(self.model.switches[k], impact) else float(mode[0, k])
+                value = float(self.model.switches[k].value(mode[0, k], float))
                 u = u.at[n + i].set(value / self.units[n + i])
         return u
 

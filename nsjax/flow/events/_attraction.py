@@ -8,7 +8,8 @@ from jaxtyping import Array, Bool, Float
 from ..._numerics._autodiff import frozen
 from ..._numerics._linalg import linear_solve, parallel
 from ..._types import Scalar, Y
-from ...system._model import ModeState, SwitchedSystem
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 
 
 Pairs = dict[tuple[int, int], tuple[Bool[Array, ""], Float[Array, ""]]]

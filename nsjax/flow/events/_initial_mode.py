@@ -8,8 +8,11 @@ from jaxtyping import Array, Bool
 from ..._numerics._autodiff import frozen
 from ..._numerics._linalg import nearly
 from ..._types import Scalar, Y
-from ...system._model import ModeState, SwitchedSystem
-from ...system._system import impact, relay, sgn
+from ...system._impact import impact
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
+from ...system._relay import relay
+from ...system._sgn import sgn
 from .._results import RESULTS
 from ._mode_choice import settle
 
@@ -34,10 +37,8 @@ def start_mode(
             roots.append(zero)
             continue
         if isinstance(switch, relay):
-            up = switch.guard(model.system, model.time(t), y) > 0
-            down = switch.off_guard(model.system, model.time(t), y) > 0
-            held = jnp.asarray(given.get(switch.name, 0), jnp.int32)
-            modes.append(jnp.where(up & ~down, 1, jnp.where(down, 0, held)).astype(jnp.int32))
+            before = jnp.asarray(given.get(switch.name, 0), jnp.int32)
+            modes.append(switch.mode_at(model.system, model.time(t), y, before))
             parts.append(None)
             roots.append(zero)
             continue

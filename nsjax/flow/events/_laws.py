@@ -7,7 +7,8 @@ from jaxtyping import Array, Bool, Int
 
 from ..._numerics._linalg import nearly
 from ..._types import Scalar, Y
-from ...system._model import ModeState, SwitchedSystem
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 from ._attraction import attraction, negligible, Pairs, reach
 
 

@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Int
 from ..._numerics._autodiff import frozen
 from ..._numerics._linalg import nearly
 from ..._types import Scalar, Y
-from ...system._model import ModeState, SwitchedSystem
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 from ._attraction import coinciding, reach
 from ._laws import Instant, judge, Outcome
 

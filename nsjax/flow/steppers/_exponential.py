@@ -19,7 +19,8 @@ from ..._numerics._jaxpr import is_affine, is_constant
 from ..._numerics._linalg import product
 from ..._numerics._series import Series
 from ..._types import Scalar, Y
-from ...system._model import ModeState, SwitchedSystem
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 from ._stepper import bernstein, jittered, stack, Step, Stepper, unresolved, Watch, with_multipliers
 
 

@@ -23,7 +23,8 @@ from ..._numerics._barrier import once
 from ..._numerics._bernstein import binomials, nodes, to_bernstein, to_chebyshev
 from ..._numerics._lane_cond import compact_cond
 from ..._types import Scalar, Y
-from ...system._model import ModeState, SwitchedSystem
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 
 
 Field = Callable[[Scalar, Y], Y]

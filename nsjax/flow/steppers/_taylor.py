@@ -16,7 +16,8 @@ from jaxtyping import Array, Float, Int
 from ..._numerics._bernstein import binomials
 from ..._numerics._series import Coefficient, Series
 from ..._types import Scalar, Y
-from ...system._model import ModeState, SwitchedSystem
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 from ._stepper import jittered, Step, Stepper, unresolved, Watch, with_multipliers
 
 

@@ -18,7 +18,8 @@ from ..._types import Scalar, Y
 from ...derivatives._saltation import states
 from ...flow._results import is_okay
 from ...flow._solve import solve
-from ...system._model import ModeState, SwitchedSystem
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 from ...system._system import System
 
 

@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._types import Scalar, Y
-from ...system._model import ModeState, SwitchedSystem
+from ...system._impact import impact
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 from ...system._parameter import Path
-from ...system._system import impact, relay
 from ._guess import landing
 from ._itinerary import Course, EVENT, GRAZING, REPELLING_EXIT, Start, TIME
 from ._segment_flow import ALWAYS, FREE_MODES, SegmentFlow, with_parameter
@@ -89,10 +90,7 @@ class OrbitCurve(eqx.Module):
         return np.append(z.ravel(), (np.asarray(value) - self.low) / self.width)
 
     def state(self, mode: Array, part: Array) -> ModeState:
-        model = self.model
-        several = [n > 1 and not isinstance(k, relay) for n, k in zip(model.parts, model.switches)]
-        parts = tuple(p if on else None for p, on in zip(part, several))
-        return ModeState(tuple(mode), parts, tuple(jnp.zeros((), jnp.int32) for _ in model.switches))
+        return ModeState.of(mode, [p if n > 1 else None for p, n in zip(part, self.model.parts)])
 
     def guard_rows(self, model: SwitchedSystem, t: Scalar, x: Array, state: ModeState) -> list[list[Scalar]]:
         """`[slot][part]`; those that no segment asks for are 1."""

@@ -16,7 +16,8 @@ from ...derivatives._variational import arcs
 from ...flow._results import is_okay
 from ...flow._solution import Solution
 from ...flow._solve import solve
-from ...system._model import ModeState, SwitchedSystem
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 from ...system._system import System
 from .._guess import base_point
 from ._arcs import model_of, Smooth

@@ -15,7 +15,8 @@ from ..._types import Scalar, Y
 from ...derivatives._saltation import states
 from ...flow._solution import Events
 from ...system._model import SwitchedSystem
-from ...system._system import arrays_of, relay, sgn, System
+from ...system._sgn import sgn
+from ...system._system import arrays_of, System
 from .._orbit import Orbit
 
 
@@ -91,7 +92,7 @@ def event_slot(model: SwitchedSystem, k: int, mode: Any, part: int, multiplier: 
         return slot_of(model, k, True, 1 if k in model.contacts or multiplier > 0 else -1), 0
     if isinstance(model.switches[k], sgn) and model.parts[k] > 1 and mode < 0:
         return slot_of(model, k, False, 0), part
-    return slot_of(model, k, False, 0 if isinstance(model.switches[k], relay) else part), 0
+    return slot_of(model, k, False, part), 0
 
 
 class EventRecord(NamedTuple):
@@ -124,7 +125,7 @@ def _looked_at(model: SwitchedSystem, like: Y, systems: System, diaries: EventRe
     unravel = jfu.ravel_pytree(like)[1]
 
     def nearest(model: SwitchedSystem, t: Scalar, y: Y) -> Array:
-        each = [() if isinstance(s, relay) else model.h(k, t, y) for k, s in enumerate(model.switches)]
+        each = [model.h(k, t, y) for k in range(len(model.switches))]
         return jnp.stack([jnp.argmin(jnp.abs(jnp.stack(h))) if len(h) > 1 else jnp.zeros((), int) for h in each])
 
     def event(system: System, t: Scalar, switch: Array, modes: Any, rows: Any) -> tuple[Array, Array, Array]:

@@ -14,7 +14,7 @@ from ..._numerics._root import find_root
 from ..._types import Scalar
 from ...derivatives._floquet import floquet, structural_zeros
 from ...system._model import SwitchedSystem
-from ...system._system import relay
+from ...system._relay import relay
 from ._equations import OrbitCurve, row_sizes
 from ._itinerary import Course, EVENT, REPELLING_EXIT, TIME
 from ._segment_flow import with_parameter

@@ -19,7 +19,8 @@ from ..._types import Scalar, Y
 from ...flow._results import is_okay
 from ...flow._solve import solve
 from ...flow.steppers._exponential import affine_parts, expm, generator
-from ...system._model import ModeState, SwitchedSystem
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 from ...system._parameter import Path, put_parameter
 from ...system._system import System
 from ._arcs import Smooth

@@ -20,8 +20,9 @@ from ...derivatives._floquet import floquet, forwards, structural_zeros
 from ...derivatives._saltation import fired, saltation_matrices
 from ...flow._results import is_okay, RESULTS
 from ...flow._solution import Events
-from ...flow.events._transition import cosine
-from ...system._model import ModeState, SwitchedSystem
+from ...flow.events._locate import cosine
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 from ...system._system import System
 from .._orbit import fractions, judge, Orbit, ravel
 from ._arcs import Arcs, Flows, model_of, SAMPLES

@@ -6,7 +6,7 @@ from ....maps._corner_normal_form import corner_kind, CornerMap, Cycle, Cycles, 
 from ....orbits.segments._equations import linearised, OrbitCurve
 from ....orbits.segments._itinerary import capacity_for, EVENT, GRAZING, REPELLING_EXIT, Start
 from ....setvalued._eigenvalue_crossings import eigenvalue_crossings
-from ....system._system import impact
+from ....system._impact import impact
 from .._bifurcation import named, OrbitBifurcation, Origin
 from .._branch_switching import (
     branch_point_at,

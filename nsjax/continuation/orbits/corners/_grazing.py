@@ -11,7 +11,7 @@ from ...._numerics._bracket import bracketed
 from ....orbits.segments._equations import OrbitCurve
 from ....orbits.segments._itinerary import capacity_for, Course, EVENT, GRAZING, Start, TIME
 from ....orbits.segments._segment_flow import with_parameter
-from ....system._system import impact
+from ....system._impact import impact
 from .._test_functions import Test
 from .._tracer import alike, OrbitPoint, OrbitTracer, Zero
 

@@ -1,0 +1,145 @@
+"""The jump of an impact: one rebound, and the sum of all that follow up to rest."""
+
+from typing import NamedTuple
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from ..._numerics._autodiff import frozen
+from ..._numerics._jaxpr import is_constant
+from ..._numerics._linalg import linear_solve
+from ..._types import Scalar, Y
+from ...system._impact import impact
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
+
+
+def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> tuple[Y, Y]:
+    """The state after an impact, by the user's reset or by Newton's law with the impulse along ∂f/∂s; and the size of
+    the terms of which it is the sum: where they cancel, what is left is their rounding.
+
+    Contacts that rest take impulses of their own, as far as these push; friction that the contact force enters acts in
+    the impact too, up to where it stops the sliding. Backwards in time Newton's law is inverted (1/e).
+    """
+    switch = model.switches[k]
+    assert isinstance(switch, impact)
+    if switch.reset_fn is not None:
+        out = switch.reset_fn(model.system, model.time(t), y)
+        if switch.inverse_fn is not None:
+            undone = switch.inverse_fn(model.system, model.time(t), y)
+            out = jax.tree.map(lambda a, b: jnp.where(model.direction > 0, a, b), out, undone)
+        return out, jax.tree.map(lambda a, b: jnp.abs(a) + jnp.abs(b), y, out)
+    assert switch.restitution_fn is not None
+    e = jnp.asarray(switch.restitution_fn(model.system), t.dtype)
+    e = jnp.where(model.direction > 0, e, 1 / e)
+    which = (k, *[j for j in model.contacts if j != k and k in model.contacts])
+    takes_part = jnp.stack([jnp.ones((), bool)] + [state.mode[j] == 1 for j in which[1:]])
+
+    def opening(y: Y) -> list[Scalar]:
+        # Only dh/dt depends on the velocities, and for given positions it is affine in them.
+        return [model.level(j, t, y, state) if j in model.contacts else model.approach(j, t, y, state) for j in which]
+
+    def hit(s: tuple) -> tuple[Y, Y]:
+        def push(j: int) -> Y:
+            unit = tuple(jnp.where(i == j, 1, 0).astype(t.dtype) for i in range(len(s)))
+            return jax.jvp(lambda s: model.field(t, y, s), (s,), (unit,))[1]
+
+        pushes = [push(j) for j in which]
+        rates = opening(y)
+        gains = [jax.jvp(opening, (y,), (p,))[1] for p in pushes]
+        if len(which) == 1:
+            impulses = [-(1 + e) * rates[0] / gains[0][0]]
+        else:
+            want = jnp.stack([-(1 + e) * rates[0]] + [-r for r in rates[1:]])
+            matrix = jnp.stack([jnp.stack(g) for g in gains], axis=1)
+            held = takes_part
+            for _ in which[1:]:
+                square = jnp.where(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
+                p = linear_solve(square, jnp.where(held, want, 0))
+                held = held & ((p >= 0) | (jnp.arange(len(which)) == 0))  # no contact pulls
+            square = jnp.where(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
+            impulses = list(linear_solve(square, jnp.where(held, want, 0)))
+        out, size = y, jax.tree.map(jnp.abs, y)
+        for p, direction in zip(impulses, pushes):
+            out = jax.tree.map(lambda a, b, p=p: a + p * b, out, direction)
+            size = jax.tree.map(lambda a, b, p=p: a + jnp.abs(p * b), size, direction)
+        return out, frozen(size)
+
+    s = model.values(t, y, state)
+    for j in model.holdable:
+        if j in model.contacts or is_constant(lambda sj, j=j: hit(s[:j] + (sj,) + s[j + 1 :])[0], s[j]):
+            continue
+
+        def slip(sj: Scalar, j: int = j) -> Scalar:
+            return model.level(j, t, hit(s[:j] + (sj,) + s[j + 1 :])[0], state)
+
+        # Where friction would reverse the sliding it ends it: the value that does so is found by one Newton step.
+        end, slope = jax.jvp(slip, (s[j],), (jnp.ones_like(s[j]),))
+        reverses = (state.mode[j] != 0) & (model.level(j, t, y, state) * end < 0) & (slope != 0)
+        stop = s[j] - end / jnp.where(slope == 0, 1, slope)
+        s = s[:j] + (jnp.where(reverses & (jnp.abs(stop) <= 1), stop, s[j]),) + s[j + 1 :]
+    return hit(s)
+
+
+def slow(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
+    """What rounding can make of dh/dt of switch k along the flow."""
+    model, t, y = frozen((model, t, y))
+    f = model.flow(t, y, state)
+    terms = model.sizes(lambda t, y: model.h(k, t, y), t, y, jnp.ones_like(t), f)
+    return 64 * jnp.finfo(t.dtype).eps * terms[0 if state.part[k] is None else state.part[k]]
+
+
+class Completed(NamedTuple):
+    """What an impact leads to: a flight, or with all the flights that would follow it a state of rest."""
+
+    rises: Bool[Array, ""]  # whether dh/dt > 0 after the impact, but for rounding
+    flight: Scalar  # how long the next flight lasts
+    rest: Scalar  # how long all flights together last
+    y: Y  # the state after all of them
+    possible: Bool[Array, ""]  # whether the flights become ever shorter
+    low: Bool[Array, ""]  # whether the next one rises so little above the rounding of h that its end is uncertain
+    stays: Bool[Array, ""]  # on the surface: a reset of the user's own may carry the state off it
+    wrong: Bool[Array, ""]  # whether the reset leads to the forbidden side
+
+
+def completed(
+    model: SwitchedSystem, k: int, te: Scalar, before: Y, after: Y, state: ModeState, state_after: ModeState
+) -> Completed:
+    """Checks an impact, and sums the sequence of ever shorter flights that follows it up to its accumulation point.
+
+    With the velocity h' after the impact, the acceleration h'' < 0 and the ratio r = -h'(t+)/h'(t-) < 1 the remaining
+    flights last 2 h' / (-h'') (1 + r + r² + ...).
+    """
+
+    def rate(t: Scalar, y: Y) -> Scalar:
+        return model.approach(k, t, y, state_after)
+
+    one, eps = jnp.ones_like(te), jnp.finfo(te.dtype).eps
+    speed = model.approach(k, te, before, state)
+    rise = rate(te, after)
+    f = model.flow(te, after, state_after)
+    pull = jax.jvp(rate, (te, after), (one, f))[1]
+    (blur,) = model.rounding(lambda t, y: (jax.jvp(rate, (t, y), (one, model.flow(t, y, state_after)))[1],), te, after)
+    h = jnp.stack(model.h(k, te, after))
+    noise = model.rounding(lambda t, y: model.h(k, t, y), te, after)
+    slack = 1e4 * noise + 2 * jnp.abs(jnp.stack(model.h(k, te, before)))
+    part = 0 if state_after.part[k] is None else state_after.part[k]
+    stays = jnp.abs(h[part]) <= slack[part]
+    least = 64 * eps * jnp.abs(speed) + slow(model, k, te, after, state_after)
+    wrong = jnp.any(h < -slack) | (stays & (rise < -jnp.maximum(1e-9 * jnp.abs(speed), least)))
+    ratio = jnp.where(speed == 0, 0, -rise / jnp.where(speed == 0, 1, speed))
+    rises = rise > least
+    # Rounding of dh/dt, where the force is but rounding too, is no flight.
+    flight = 2 * (rise - jnp.where(rises, 0, lax.stop_gradient(rise))) / jnp.where(pull < 0, -pull, 1)
+    held = stays & ~rises & (jnp.abs(pull) <= blur)  # without any force
+    possible = stays & ~wrong & ((pull < 0) | held) & (ratio < 1)
+    rest = jnp.where(possible, flight / (1 - jnp.where(possible, ratio, 0)), 0)
+    drift = jax.tree.map(lambda x, f: x + rest * f, after, f)
+    impulse = jax.tree.map(jnp.subtract, after, before)
+    left, gain = jax.jvp(lambda y: rate(te, y), (drift,), (impulse,))
+    scale = jnp.where(gain == 0, 0, left / jnp.where(gain == 0, 1, gain))
+    rested = jax.tree.map(lambda x, d: x - scale * d, drift, impulse)
+    low = 0.25 * flight * rise <= 1e3 * noise[part]
+    return Completed(rises, flight, rest, rested, possible, low, stays, wrong)

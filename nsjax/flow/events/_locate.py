@@ -1,0 +1,174 @@
+"""Where exactly the first event of a step is."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..._numerics._autodiff import frozen
+from ..._numerics._barrier import once
+from ..._numerics._bernstein import at, deflate, falls, first_root, largest
+from ..._types import Scalar, Y
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
+from ..steppers._stepper import Stepper
+
+
+class Interval(NamedTuple):
+    """A step in one mode, on which guards may fall to zero."""
+
+    t: Scalar
+    t_next: Scalar
+    y: Y  # at its beginning
+    f: Y  # the field there
+    state: ModeState
+    polynomials: Any  # of the guards, a list of arrays `(slots, parts)`: one for each Bernstein coefficient
+    noise: Any  # their rounding, `(slots, parts)`
+
+
+class Located(NamedTuple):
+    """The first event on an interval."""
+
+    found: Bool[Array, ""]
+    t: Scalar
+    y: Y  # before it
+    slot: Int[Array, ""]  # of the guard that fires
+    part: Int[Array, " slots"]  # of each guard the component that is active there
+    missed: Float[Array, " slots"]  # of each guard its least value, if it comes near to zero before and rises again
+
+
+def step_to(te: Scalar, stepper: Stepper, args: tuple) -> tuple[Y, list[Y]]:
+    model, t, y, f0, state, *_ = args
+    step = stepper(model, state, t, te, y, f0)
+    return step.y1, step.ks
+
+
+def _guard(te: Scalar, y: Y, args: tuple) -> Scalar:
+    model, _, _, _, state, slot, part, _ = args
+    return model.stacked(model.guards(te, y, state), -1.0)[slot, part]
+
+
+@eqx.filter_custom_jvp
+def _arrival(te: Scalar, y_end: Y, stepper: Stepper, args: Any) -> tuple[Scalar, Y]:
+    """The time of an event and the state there, differentiated by the implicit rule.
+
+    With g the guard that fires, dte = -dg / (dg/dt along the flow), where dg is its change at fixed time; the state
+    moves along the flow by dte. The rule refers to this function again, so that derivatives of every order are right.
+    At a tangency dg/dt = 0 and they are infinite, as they should be.
+    """
+    return te, y_end
+
+
+@_arrival.def_jvp
+def _arrival_jvp(primals: Any, tangents: Any) -> tuple[tuple[Scalar, Y], tuple[Scalar, Y]]:
+    te, y_end, stepper, args = primals
+    te, y_end = _arrival(te, y_end, stepper, args)
+    model, state, found = args[0], args[4], args[7]
+    moved = eqx.filter_jvp(lambda args: step_to(te, stepper, args)[0], (args,), (tangents[3],))[1]
+    moved = jax.tree.map(lambda y, d: jnp.zeros_like(y) if d is None else d, y_end, moved)
+    change = eqx.filter_jvp(lambda y, args: _guard(te, y, args), (y_end, args), (moved, tangents[3]))[1]
+    change = jnp.zeros_like(te) if change is None else change
+    f = model.flow(te, y_end, state)
+    slope = jax.jvp(lambda t, y: _guard(t, y, args), (te, y_end), (jnp.ones_like(te), f))[1]
+    shift = -change / jnp.where(found, slope, 1)
+    return (te, y_end), (shift, jax.tree.map(lambda d, f: d + f * shift, moved, f))
+
+
+def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
+    """The earliest event of a step. Without one, what is told is of the guard that comes nearest to zero and rises
+    again.
+
+    The root on the dense output is only where to look: the step is taken again to it, and one Newton step with the true
+    field corrects the time, and with it the order of events closer than the dense output can tell. The state follows by
+    its Taylor series to second order, so that what remains is of third order in the (small) error of the dense output.
+    """
+    t, t_next, y, f0, state, polynomials, noise = step
+    known = model.stacked(model.known_roots(state), 0)
+    # In the same search where each guard is least: what comes near to zero, and does not meet it, is told.
+    single = jnp.asarray([slot.switch not in model.clocks and model.parts[slot.switch] == 1 for slot in model.slots])
+    first = jnp.arange(known.shape[1]) == 0
+    lows = [jnp.where(first, x, -1.0) for x in falls(polynomials)]
+    both = [jnp.concatenate(pair) for pair in zip(deflate(polynomials, known), lows)]
+    (found, turns), (root, low) = (jnp.split(x, 2) for x in jax.vmap(first_root)(both))
+    single = single & (known[:, 0] == 0)
+    turns = turns & (low > 0) & single
+    args = (model, t, y, f0, state)
+    frozen_model, start, y_start, f_start, _ = frozen(args)
+
+    def flow(t: Scalar, y: Y) -> Y:
+        return frozen_model.flow(t, y, state)
+
+    def guards(t: Scalar, y: Y) -> Array:
+        return model.stacked(frozen_model.guards(t, y, state), -1.0)
+
+    # A multiplier that stays at its bound, or a guard which begins with a double root, has no sign if it does not rise
+    # above rounding on the whole step.
+    least = jnp.asarray([0 if slot.holding else 2 for slot in model.slots], known.dtype)[:, None]
+    found = found & ~jnp.any((once(largest(polynomials)) <= noise) & (known >= least), axis=-1)
+    root = jnp.where(found, root, jnp.inf)
+    earliest = jnp.min(root)
+    length = lax.stop_gradient(t_next) - start
+    met = jnp.any(found)
+    dips = jnp.where(turns & (low < earliest), at(polynomials, low)[:, 0], jnp.inf)
+    nearest = jnp.argmin(dips / once(largest(polynomials))[:, 0])
+    guess = start + jnp.where(met, jnp.minimum(earliest, 1), jnp.where(turns[nearest], low[nearest], 1)) * length
+
+    y_guess = stepper(frozen_model, state, start, guess, y_start, f_start).y1
+    f = flow(guess, y_guess)
+    one = jnp.ones_like(guess)
+    values, rates = jax.jvp(guards, (guess, y_guess), (one, f))
+    part = jnp.argmax(values, axis=-1)
+    value = jnp.take_along_axis(values, part[:, None], axis=-1)[:, 0]
+    rate = jnp.take_along_axis(rates, part[:, None], axis=-1)[:, 0]
+    shift = -value / jnp.where(rate == 0, 1, rate)
+    # Where no root was found too the arithmetic must be of numbers: going backwards zero times that is not none.
+    plain = jnp.where(found, root - earliest, 0) * length
+    trusted = (rate < 0) & (jnp.abs(shift) <= 1e-2 * length) & (plain <= 1e-4 * length)
+    shift = jnp.where(trusted, shift, plain)
+    # Of events at one instant the first in the order of declaration: as long as no guard has fallen below its rounding.
+    blur = jnp.take_along_axis(noise, part[:, None], axis=-1)[:, 0] / jnp.where(rate == 0, 1, jnp.abs(rate))
+    latest = jnp.min(jnp.where(found, shift + jnp.where(trusted, blur, 0), jnp.inf))
+    slot = jnp.where(met, jnp.argmax(found & (shift <= latest)), nearest).astype(jnp.int32)
+    # The dense output tells how near that comes; without an event the step leads to the nearest of them itself.
+    missed = jnp.where(~met & (jnp.arange(len(dips)) == nearest) & (dips < jnp.inf), value, dips)
+    if model.clocks:  # at a tick a guard may jump away from zero as it comes to it
+        ticks = met & jnp.asarray([k in model.clocks for k, _, _ in model.slots])[slot]
+        falls_on = ticks & single & (value > 0) & (rate < 0)
+        missed = jnp.where(falls_on, jnp.minimum(missed, value), missed)
+    te = jnp.clip(guess + shift[slot], start, start + length)
+    dt = te - guess
+    bend = jax.jvp(flow, (guess, y_guess), (one, f))[1]
+    y_end = jax.tree.map(lambda y, f, b: y + dt * (f + 0.5 * dt * b), y_guess, f, bend)
+    te, y_end = _arrival(te, y_end, stepper, (*args, slot, part[slot], met))
+    # At the very start of the step the event is a consequence of the one before: it has the same time and derivative.
+    at_once = jnp.isfinite(root[slot]) & (root[slot] <= 0)
+    te, y_end = jax.tree.map(lambda a, b: jnp.where(at_once, a, b), (t, y), (te, y_end))
+    return Located(met, te, y_end, slot, part, missed)
+
+
+def transversality(
+    model: SwitchedSystem, t: Scalar, y: Y, state: ModeState, part: Int[Array, " slots"], tolerance: Any
+) -> tuple[Float[Array, " slots"], Float[Array, " slots"]]:
+    """Of each guard the cosine between the trajectory and the normal of its surface, in time and state; and what an
+    error of the state within the tolerance (relative, absolute) makes of it."""
+    model, t, y = frozen((model, t, y))
+    flat, unravel = jfu.ravel_pytree(y)
+
+    def guards(t: Scalar, x: Array) -> Float[Array, " slots"]:
+        return model.stacked(model.guards(t, unravel(x), state), -1.0)[np.arange(len(model.slots)), part]
+
+    h_t, n = jax.jacfwd(guards, argnums=(0, 1))(t, flat)
+    rtol, atol = tolerance
+    f = jfu.ravel_pytree(model.flow(t, y, state))[0]
+    return jax.vmap(cosine, (0, 0, None))(h_t, n, f), jnp.abs(n) @ (atol + rtol * jnp.abs(flat))
+
+
+def cosine(h_t: Scalar, n: Float[Array, " n"], f: Float[Array, " n"]) -> Scalar:
+    """Between the trajectory and the normal (h_t, n) of a surface."""
+    size = (n @ n + h_t**2) * (f @ f + jnp.where(h_t == 0, 0, 1))
+    return jnp.abs(n @ f + h_t) / jnp.sqrt(size)

@@ -1,0 +1,109 @@
+"""The time of a model with clocks: at a tick, functions of time are taken from the side on which the mode is."""
+
+import functools as ft
+from typing import Any, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from .._numerics._autodiff import frozen
+from .._types import Mode, Scalar
+from ._clock import clock
+from ._mode import ModeState
+from ._switch import AbstractSwitch
+from ._system import System
+
+
+class Clocked(eqx.Module):
+    """A system in a time that always increases, and is kept between two ticks."""
+
+    system: System
+    direction: Any  # +1 or -1
+    switches: tuple[AbstractSwitch, ...] = eqx.field(static=True)
+    clocks: tuple[int, ...] = eqx.field(static=True)  # switches that tick
+    window: tuple[Scalar, Scalar] | None  # the ticks between which time is kept
+
+    def __init__(self, system: System, direction: Any):
+        self.system = system
+        self.direction = direction
+        self.window = None
+        self.switches = system.switches
+        self.clocks = self.of(clock)
+
+    def of(self, kind: type[AbstractSwitch]) -> tuple[int, ...]:
+        """Which switches are of a kind."""
+        return tuple(k for k, switch in enumerate(self.switches) if isinstance(switch, kind))
+
+    def _clock(self, k: int) -> clock:
+        switch = self.switches[k]
+        assert isinstance(switch, clock)
+        return switch
+
+    def within(self, mode: Mode) -> Self:
+        """The same for a mode, that tells between which ticks it is."""
+        if not self.clocks:
+            return self
+        spans = [self.span(k, mode) for k in self.clocks]
+        low, high = (ft.reduce(pick, ends) for pick, ends in zip((jnp.maximum, jnp.minimum), zip(*spans)))
+        return eqx.tree_at(
+            lambda m: m.window, self, frozen((low, high)), is_leaf=lambda x: x is None or x is self.window
+        )
+
+    def at(self, t: Scalar) -> Self:
+        """The same for what sets out at time `t`."""
+        zero, counts = jnp.zeros((), jnp.int32), self.counts(t)
+        return self.within(tuple(counts.get(k, zero) for k in range(len(self.switches))))
+
+    def _in(self, state: ModeState) -> Self:
+        return self if self.window is not None else self.within(state.mode)
+
+    def span(self, k: int, mode: Mode) -> tuple[Scalar, Scalar]:
+        """The last and the next tick of clock k, in the time of the user."""
+        switch = self._clock(k)
+        return switch.span(self.system, mode[k], jnp.ones((), jnp.result_type(self.direction)))
+
+    def countable(self, t: Scalar) -> Bool[Array, ""]:
+        """Whether the ticks of all clocks can be told apart and counted up to `t`, in the time of the user."""
+        good = jnp.ones((), bool)
+        for k in self.clocks:
+            good = good & self._clock(k).countable(self.system, t)
+        return good
+
+    def counts(self, t: Scalar) -> dict[int, Int[Array, ""]]:
+        """How often each clock has ticked."""
+        passed = {}
+        for k in self.clocks:
+            passed[k] = self._clock(k).count(self.system, frozen(t * self.direction), self.direction > 0)
+        return passed
+
+    def tick(self, k: int, mode: Mode) -> Scalar:
+        """When time, increasing as the flow sees it, meets the next tick of clock k."""
+        low, high = self.span(k, mode)
+        return jnp.where(self.direction > 0, high, -low)
+
+    def next_tick(self, mode: Mode) -> Scalar:
+        """The same of the clock that ticks first."""
+        return ft.reduce(jnp.minimum, [self.tick(k, mode) for k in self.clocks])
+
+    def time(self, t: Scalar) -> Scalar:
+        """The time of the user, kept between the ticks of the mode.
+
+        As near to a tick as rounding takes it (and `t % T` or `floor(t / T)` with it) it is put on the right side;
+        beyond, where only a search that has not converged yet goes, it stands still. (By comparisons: to a power series
+        in t a shift is a number, but a maximum of t and the tick is the one or the other.)
+        """
+        t = t * self.direction
+        if self.window is None:
+            return t
+        (low, high), margin = self.window, self.margin(t)
+        shift = jnp.where(t < low + margin, 2 * margin, 0) - jnp.where(t > high - margin, 2 * margin, 0)
+        kept = jnp.where(t < low - margin, low + margin, t + shift)
+        return jnp.where(t > high + margin, high - margin, kept)
+
+    def margin(self, t: Scalar) -> Scalar:
+        """How near to a tick time is within rounding of it; there it is shifted by twice as much."""
+        assert self.window is not None
+        ends = (*self.window, frozen(t))
+        size = ft.reduce(jnp.maximum, [jnp.where(jnp.isfinite(x), jnp.abs(x), 0) for x in ends])
+        return 100 * float(jnp.finfo(t.dtype).eps) * size + float(jnp.finfo(t.dtype).tiny) ** 0.75

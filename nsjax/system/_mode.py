@@ -1,0 +1,41 @@
+"""The mode of a system: one small integer for each switch."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from .._types import Mode
+
+
+BEYOND = 4  # added, with its sign, to the roots of a switch that is held with |λ| > 1 in backward time
+
+
+class Slot(NamedTuple):
+    """One guard: a function that is positive while the mode lasts."""
+
+    switch: int  # position of its switch
+    part: int  # component of h, or the sign of the bound that λ reaches
+    holding: bool  # whether it watches λ
+
+
+class ModeState(NamedTuple):
+    """A mode, with the component of h that is active on the surface of each switch (None for a smooth surface) and
+    the number of roots at the present instant, to be left out when the next one is sought; of a switch that is held the
+    sign of the bound that its value is at, or 0, and see `SwitchedSystem.edge`."""
+
+    mode: Mode
+    part: tuple[Int[Array, ""] | None, ...]
+    roots: tuple[Int[Array, ""], ...]
+
+    @classmethod
+    def of(cls, mode: Any, part: Any) -> "ModeState":
+        """Of switches none of which has just left its surface."""
+        return cls(tuple(mode), tuple(part), tuple(jnp.zeros((), jnp.int32) for _ in mode))
+
+
+def pick(values: tuple[Any, ...], index: Any) -> Any:
+    """One of several, by an index that may be traced, or None if there is but one."""
+    if index is None or len(values) == 1:
+        return values[0]
+    return jnp.stack(values)[index]

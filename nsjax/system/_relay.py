@@ -1,0 +1,93 @@
+"""The switch with memory: on, or off, with hysteresis between its two surfaces."""
+
+from collections.abc import Callable
+from typing import Any, Self, TYPE_CHECKING
+
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from .._types import Guard, Scalar, Y
+from ._mode import ModeState, Slot
+from ._switch import AbstractSwitch
+
+
+if TYPE_CHECKING:
+    from ._model import SwitchedSystem
+    from ._system import System
+
+
+class relay(AbstractSwitch):
+    """A switch with memory: its value is 0 or 1, with a surface of its own for each change.
+
+    Both surfaces are levels and not edges: a relay that is on while its `off` indicator function is above zero switches
+    off at once, wherever that came from (a start, an impact, a tick of a clock). Where both are above zero it chatters.
+
+    ```python
+    @nsjax.relay
+    def heater(self, t, y):        # switches on where this rises through zero
+        return self.T_low - y.T
+
+    @heater.off
+    def heater(self, t, y):        # switches off where this rises through zero
+        return y.T - self.T_high
+    ```
+    """
+
+    modes = (0, 1)
+    off_guard: Guard = None
+
+    if TYPE_CHECKING:
+
+        def __new__(cls, guard: Guard, *, name: str | None = None) -> "_Relay": ...
+
+    def off(self, fn: Guard) -> Self:
+        """Decorates `h_off(self, t, y)`: the relay switches off where it rises through zero."""
+        return self._with(off_guard=fn)
+
+    def surfaces(self, system: "System", t: Scalar, y: Y) -> tuple[Scalar, ...]:
+        return self.guard(system, t, y), self.off_guard(system, t, y)
+
+    def rising(self, system: "System", t: Scalar, y: Y, mode: Int[Array, ""]) -> Scalar:
+        """The indicator function that makes it leave its mode where it rises through zero."""
+        on, off = self.surfaces(system, t, y)
+        return jnp.where(mode == 1, off, on)
+
+    def mode_at(self, system: "System", t: Scalar, y: Y, before: Any) -> Int[Array, ""]:
+        """Its mode at a state, which within the hysteresis is the one that it had `before`."""
+        on, off = (h > 0 for h in self.surfaces(system, t, y))
+        return jnp.where(on & ~off, 1, jnp.where(off, 0, before)).astype(jnp.int32)
+
+    def next_mode(self, mode: Int[Array, ""], direction: Any) -> Int[Array, ""]:
+        return 1 - mode
+
+    def modes_after(self, direction: int) -> tuple[int, ...]:
+        return ((1 + direction) // 2,) if direction else (1, 0)
+
+    def words(self, mode: int) -> str:
+        return f"{self.name} {'on' if mode else 'off'}"
+
+    def surface(self, model: "SwitchedSystem", k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
+        return self.rising(model.system, model.time(t), y, state.mode[k])
+
+    def guard_row(self, model: "SwitchedSystem", slot: Slot, t: Scalar, y: Y, state: ModeState) -> list[Scalar]:
+        return [-self.rising(model.system, model.time(t), y, state.mode[slot.switch])]
+
+    def check(self, system: "System", t: Scalar, y: Y, along: Callable[[Scalar], Y]) -> None:
+        owner = type(system).__name__
+        self._check_guard(system, self.name, self.guard, t, y)
+        if self.off_guard is None:
+            raise ValueError(
+                f"`{owner}.{self.name}` is a relay without the surface on which it switches off; add one with "
+                f"`@{self.name}.off`."
+            )
+        self._check_guard(system, f"{self.name}.off", self.off_guard, t, y)
+        if any(isinstance(h, tuple) for h in self.surfaces(system, t, y)):
+            raise ValueError(f"`{owner}.{self.name}` is a relay: its surfaces must be scalars, not tuples.")
+
+    def one_way(self, owner: str) -> str | None:
+        return f"`{owner}.{self.name}` is a relay, whose memory cannot be run backwards in time."
+
+
+if TYPE_CHECKING:
+
+    class _Relay(relay, property): ...  # see `sgn`

@@ -1,0 +1,151 @@
+"""What every switch of a model has: an indicator function, modes, and guards that tell when the mode ends."""
+
+import abc
+import copy
+import functools as ft
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, ClassVar, Self, TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from .._types import Guard, Scalar, Y
+from ._mode import ModeState, pick, Slot
+
+
+if TYPE_CHECKING:
+    from ._model import SwitchedSystem
+    from ._system import System
+
+
+class AbstractSwitch(abc.ABC):
+    """One nonsmooth element of a model. Made by the decorators `sgn`, `relay`, `impact` and `clock`.
+
+    `guard(system, t, y)` is the indicator function h of the thesis (2.8). It returns a scalar, or a tuple of scalars
+    which means their minimum (a surface with a corner, such as the support of section 3.5).
+    """
+
+    modes: ClassVar[tuple[int, ...]] = ()  # those that a user may name
+    order: ClassVar[int] = 0  # which derivative of h its value can keep at zero, and so hold the solution; 0: none
+    holding: ClassVar[int] = 0  # the mode in which it does so
+
+    guard: Guard
+    name: str
+    ends: tuple[int, ...] = ()  # where an event of this switch leads to one of these modes the solution ends
+
+    def __init__(self, guard: Guard, *, name: str | None = None):
+        if not callable(guard):
+            raise TypeError(f"A `{type(self).__name__}` must decorate a method `h(self, t, y)`, but got {guard!r}.")
+        self.guard = guard
+        self.name = name or getattr(guard, "__name__", "")
+        if not self.name.isidentifier() or self.name == "<lambda>":
+            raise ValueError(
+                f"A `{type(self).__name__}` needs a name that is an identifier, but got {self.name!r}; pass `name=...`."
+            )
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        """On an instance: the indicator function h(t, y) bound to it. On the class: the switch itself."""
+        return self if instance is None else partial(self.guard, instance)
+
+    def _with(self, **parts: Any) -> Self:
+        new = copy.copy(self)
+        vars(new).update(parts)
+        return new
+
+    def components(self, system: "System", t: Scalar, y: Y) -> tuple[Scalar, ...]:
+        """h as a tuple of scalars, whose minimum is the indicator function."""
+        h = self.guard(system, t, y)
+        return h if isinstance(h, tuple) else (h,)
+
+    def surfaces(self, system: "System", t: Scalar, y: Y) -> tuple[Scalar, ...]:
+        """All indicator functions at whose zeros its mode may change."""
+        return self.components(system, t, y)
+
+    def value(self, mode: Int[Array, ""], dtype: Any) -> Scalar:
+        """What `vector_field` is given for it in a mode, unless it holds the solution."""
+        return mode.astype(dtype)
+
+    @property
+    def static(self) -> bool:
+        """Whether it can hold with a larger |value| than it has off its surface."""
+        return False
+
+    def bound(self, system: "System") -> Any:
+        """The largest |value| with which it can hold the solution."""
+        return math.inf
+
+    def next_mode(self, mode: Int[Array, ""], direction: Any) -> Int[Array, ""]:
+        """Its mode after it has fired, as far as that is told by the mode before."""
+        return mode
+
+    def modes_after(self, direction: int) -> tuple[int, ...]:
+        """The modes to which its event leads where h rises (`direction` 1), falls (-1), or either (0)."""
+        return self.modes
+
+    def words(self, mode: int) -> str:
+        """The mode as a legend names it, if it needs to be named."""
+        return ""
+
+    # Its guards, positive while the mode lasts, as `SwitchedSystem.guards` puts them together.
+
+    def surface(self, model: "SwitchedSystem", k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
+        """The indicator function that is zero at its next event, unless that is a bound of its value."""
+        return pick(model.h(k, t, y), state.part[k])
+
+    @abc.abstractmethod
+    def guard_row(self, model: "SwitchedSystem", slot: Slot, t: Scalar, y: Y, state: ModeState) -> list[Scalar]:
+        """The guard of a slot, whose event is the instant at which the last of its entries falls to zero."""
+
+    def bound_guard(self, model: "SwitchedSystem", slot: Slot, value: Scalar, state: ModeState) -> Scalar:
+        """How far its value is from the bound at which it ceases to hold."""
+        raise NotImplementedError
+
+    def known_row(self, model: "SwitchedSystem", slot: Slot, roots: Any, state: ModeState) -> list[Int[Array, ""]]:
+        """How many roots each entry of `guard_row` has at the present instant, of `roots` that its surface has."""
+        part = state.part[slot.switch]
+        return [roots] if part is None else [jnp.where(part == slot.part, roots, 0)]
+
+    # Mistakes.
+
+    @abc.abstractmethod
+    def check(self, system: "System", t: Scalar, y: Y, along: Callable[[Scalar], Y]) -> None:
+        """Raises for mistakes that need no numbers to be seen; `along` is the vector field as a function of the value
+        of this switch."""
+
+    def laws(self, system: "System") -> list[tuple[str, str, Any, Any]]:
+        """What must hold for its numbers: the name of its method, the law, whether it holds, the number."""
+        return []
+
+    def one_way(self, owner: str) -> str | None:
+        """What keeps a system that has it from being run backwards, if anything does."""
+        return None
+
+    def _check_guard(self, system: "System", name: str, guard: Any, t: Scalar, y: Y) -> None:
+        h = jax.eval_shape(lambda: guard(system, t, y))
+        for part in h if isinstance(h, tuple) and not hasattr(h, "_fields") else (h,):
+            if not isinstance(part, jax.ShapeDtypeStruct) or part.shape != () or part.dtype != t.dtype:
+                got = part if not isinstance(part, jax.ShapeDtypeStruct) else f"{part.dtype}{list(part.shape)}"
+                raise ValueError(
+                    f"`{type(system).__name__}.{name}` must return a scalar of dtype {t.dtype} (or a tuple of them, "
+                    f"meaning their minimum), but returned {got}. For many surfaces define a switch for each, or "
+                    "override `switches`."
+                )
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name})"
+
+
+@ft.cache  # switches are told apart by identity
+def forwarded(switch: AbstractSwitch) -> Any:
+    """The switch for a system that has the switch's own system as its field `system`."""
+
+    def forward(fn: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda self, *args: fn(self.system, *args)
+
+    return switch._with(**{name: forward(part) for name, part in vars(switch).items() if callable(part)})
