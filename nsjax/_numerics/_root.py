@@ -1,7 +1,7 @@
 """Roots of equations with parameters, and their derivatives by the implicit function theorem."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,12 +14,18 @@ from jaxtyping import Array, Bool
 from ._autodiff import dense_jacobian, frozen
 
 
+class Newton(NamedTuple):
+    """When Newton's method ends."""
+
+    tol: Any  # relative and absolute, of the unknowns
+    max_iterations: int
+
+
 def find_root(
     residual: Callable[[Any, Any], Any],
     guess: Any,
     parameters: Any,
-    tol: float,
-    max_iterations: int,
+    newton: Newton,
     *,
     well_posed: bool | None = None,
 ) -> tuple[Any, Bool[Array, ""]]:
@@ -32,10 +38,10 @@ def find_root(
     """
     found = optx.root_find(
         lambda z, p: dense_jacobian(residual, z, p),
-        optx.Newton(rtol=tol, atol=tol, linear_solver=lx.AutoLinearSolver(well_posed=well_posed)),
+        optx.Newton(rtol=newton.tol, atol=newton.tol, linear_solver=lx.AutoLinearSolver(well_posed=well_posed)),
         frozen(guess),
         args=frozen(parameters),
-        max_steps=max_iterations,
+        max_steps=newton.max_iterations,
         throw=False,
     )
     converged = found.result == optx.RESULTS.successful

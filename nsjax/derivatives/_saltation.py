@@ -39,15 +39,6 @@ def _modes(system: System, mode: Any) -> tuple[Int[Array, ""], ...]:
     return tuple(jnp.asarray(m, jnp.int32) for m in mode)
 
 
-def states(model: SwitchedSystem, t: Scalar, y: Y, mode: tuple) -> ModeState:
-    """A mode with the component of h that is on its surface: the one nearest to zero."""
-    parts = [
-        None if n == 1 else jnp.argmin(jnp.abs(jnp.stack(model.h(k, t, y)))).astype(jnp.int32)
-        for k, n in enumerate(model.parts)
-    ]
-    return ModeState.of(mode, parts)
-
-
 def fired(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
     """The guard of switch k that is at zero: its surface, or while sliding the bound that λ has reached."""
     surface = model.switches[k].surface(model, k, t, y, state)
@@ -67,7 +58,7 @@ def landed(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState, aft
     # (Between two ticks: a segment that follows may be the first of the next period.)
     after = tuple(state.mode[j] if j in model.clocks else m for j, m in enumerate(after))
     free = jnp.zeros_like(after[k])
-    flight = states(model, t, bounced, after[:k] + (free,) + after[k + 1 :])
+    flight = model.state_at(t, bounced, after[:k] + (free,) + after[k + 1 :])
     end = completed(model, k, t, y, bounced, state, flight)
     lands, rests = state.mode[k] == 0, after[k] == 1  # to lift off is no jump
     rest = jnp.where(rests, end.rest, 0)
@@ -77,7 +68,7 @@ def landed(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState, aft
 
 
 def _held(model: SwitchedSystem, t: Scalar, y: Y, mode: tuple) -> Y:
-    return model.project(t, y, states(model, t, y, mode))
+    return model.project(t, y, model.state_at(t, y, mode))
 
 
 class _Jump(NamedTuple):
@@ -101,7 +92,7 @@ def _jump(model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after: 
     def ravel(y: Y) -> Array:
         return jfu.ravel_pytree(y)[0]
 
-    state = states(model, t, y, before)
+    state = model.state_at(t, y, before)
     h_t, n = jax.jacfwd(lambda t, x: fired(model, k, t, unravel(x), state), argnums=(0, 1))(t, flat)
     f_before = ravel(model.flow(t, y, state))
     onto = jnp.eye(flat.size, dtype=flat.dtype)
@@ -115,7 +106,7 @@ def _jump(model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after: 
     if isinstance(model.switches[k], impact):
         rests = (before[k] == 0) & (after[k] == 1)
         onto = jnp.where(rests, jax.jacfwd(lambda x: ravel(_held(model, t + rest, unravel(x), after)))(x), onto)
-    later = states(model, t, unravel(x), after)
+    later = model.state_at(t, unravel(x), after)
     f_after = ravel(model.flow(t, unravel(x), later))
     still, at, begin, end, drift = frozen((model, t, flat, x, jnp.abs(t * f_before)))
 
@@ -180,7 +171,7 @@ def saltation_matrix(
         raise ValueError(f"Argument `switch` must be one of {', '.join(names) or 'no switches'}, but got {switch!r}.")
     t, y = _float(t, y)
     system = arrays_of(system, t.dtype)
-    model = SwitchedSystem(system, jnp.ones_like(t), t, y)
+    model = SwitchedSystem.forwards(system, t, y)
     before, after = _modes(system, mode_before), _modes(system, mode_after)
     return _matrix(model, t, y, names.index(switch), before, after)
 

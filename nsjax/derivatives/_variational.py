@@ -11,14 +11,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, Y
-from ..flow._arguments import check_solve
+from ..flow._arguments import checked_start, checked_time
+from ..flow._integrator import Integrator
+from ..flow._mode_flow import VariedModeFlow
 from ..flow._results import raise_if, RESULTS
 from ..flow._solution import Solution
-from ..flow._solve import solve
-from ..system._mode import ModeState
+from ..flow._solve import integrate, solve
 from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, System
-from ._saltation import saltation_matrices, states
+from ._saltation import saltation_matrices
 
 
 def fundamental_matrix(
@@ -56,33 +57,23 @@ def fundamental_matrix(
     """
     if method not in ("variational", "autodiff"):
         raise ValueError(f"Argument `method` must be 'variational' or 'autodiff', but got {method!r}.")
-    y0, t0, t1, solver, controller, _ = check_solve(
-        system, t0, t1, y0, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events, None
-    )
-    if stepsize_controller is None:
-        tol = 1e-10 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-5
-        controller = dfx.PIDController(rtol=tol, atol=tol)
-    kwargs: dict[str, Any] = dict(
-        mode=mode,
-        solver=solver,
-        stepsize_controller=controller,
-        max_steps=max_steps,
-        max_events=max_events,
-        throw=throw,
-    )
+    t0, y0, _ = checked_start(system, t0, y0, mode)
+    t1 = checked_time("t1", t1, t0.dtype)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, (1e-10, 1e-5))
+    how: dict[str, Any] = dict(mode=mode, throw=throw) | integrator._asdict()
     flat, unravel = jfu.ravel_pytree(y0)
     times = jnp.asarray([t1] if ts is None else ts, t0.dtype)
     if method == "autodiff":
         saveat = dfx.SaveAt(t1=True) if ts is None else dfx.SaveAt(ts=jnp.asarray(ts, t0.dtype))
 
         def flow(x: Array) -> tuple[Array, Solution]:
-            sol = solve(system, t0, t1, unravel(x), saveat=saveat, **kwargs)
+            sol = solve(system, t0, t1, unravel(x), saveat=saveat, **how)
             return jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys), sol
 
         phi, sol = jax.jit(jax.jacfwd(flow, has_aux=True))(flat)
     else:
-        sol = solve(system, t0, t1, y0, **kwargs)
-        whole, phi = _by_arcs(arrays_of(system, t0.dtype), sol, t0, y0, times, solver, controller, max_steps)
+        sol = solve(system, t0, t1, y0, **how)
+        whole, phi = _by_arcs(arrays_of(system, t0.dtype), sol, t0, y0, times, integrator)
         phi = whole[None] if ts is None else phi
     beyond = _beyond_grazing(sol, t0, times)
     phi = jnp.where(beyond[:, None, None], jnp.nan, phi)
@@ -117,27 +108,9 @@ def arcs(sol: Solution, t0: Scalar, y0: Y) -> tuple[Array, Array, Y, Array]:
     return begin, end, rows(y0, events.y_after, sol.y1), rows(sol.mode0, events.mode_after, sol.mode1)
 
 
-def monodromy_by_arcs(
-    system: System, sol: Solution, t0: Scalar, y0: Y, solver: Any, controller: Any, max_steps: int = 4096
-) -> Float[Array, "n n"]:
+def monodromy_by_arcs(system: System, sol: Solution, t0: Scalar, y0: Y, integrator: Integrator) -> Float[Array, "n n"]:
     """Φ at the end of `sol`, by the variational equation and the saltation formula."""
-    return _by_arcs(system, sol, t0, y0, sol.t1[None], solver, controller, max_steps)[0]
-
-
-class _Arc(System):
-    """y and Φ on an arc in a fixed mode: a smooth system, Φ' = (∂f/∂y) Φ. Its columns are perturbations, of the
-    structure of the state, with one leading axis."""
-
-    model: SwitchedSystem
-    state: ModeState
-
-    def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
-        y, columns = y
-
-        def rhs(y: Y) -> Y:
-            return self.model.flow(t, y, self.state)
-
-        return rhs(y), jax.vmap(lambda column: jax.jvp(rhs, (y,), (column,))[1])(columns)
+    return _by_arcs(system, sol, t0, y0, sol.t1[None], integrator)[0]
 
 
 @eqx.filter_jit
@@ -147,14 +120,12 @@ def _by_arcs(
     t0: Scalar,
     y0: Y,
     times: Array,
-    solver: dfx.AbstractSolver,
-    controller: dfx.AbstractStepSizeController,
-    max_steps: int,
+    integrator: Integrator,
 ) -> tuple[Float[Array, "n n"], Float[Array, "times n n"]]:
     """Φ at the end of `sol`, with the jump of an event there, and at `times`, from the arcs between the events and the
     jumps at these."""
     flat, unravel = jfu.ravel_pytree(y0)
-    model = SwitchedSystem(system, jnp.ones_like(t0), t0, y0)
+    model = SwitchedSystem.forwards(system, t0, y0)
     n = flat.size
     eye = jnp.eye(n, dtype=flat.dtype)
     begin, end, state, modes = arcs(sol, t0, y0)
@@ -169,15 +140,13 @@ def _by_arcs(
 
     def arc(phi: Array, row: tuple) -> tuple[Array, Array]:
         a, b, y, mode, jump = row
-        smooth = _Arc(model, states(model, a, y, tuple(mode)))
+        smooth = VariedModeFlow(model, model.state_at(a, y, tuple(mode)))
         # On an arc that runs backwards so do the times.
         low, high = jnp.minimum(a, b), jnp.maximum(a, b)
         inside = jnp.clip(times, low, high)
         order = jnp.argsort(jnp.where(b >= a, inside, -inside))
-        out = solve(
-            smooth, a, b, (y, jax.vmap(unravel, in_axes=1)(jump @ phi)), saveat=dfx.SaveAt(ts=inside[order]),
-            solver=solver, stepsize_controller=controller, max_steps=max_steps, throw=False,
-        )  # fmt: skip
+        varied = y, jax.vmap(unravel, in_axes=1)(jump @ phi)
+        out = integrate(smooth, a, b, varied, integrator, saveat=dfx.SaveAt(ts=inside[order]))
         along = jax.vmap(matrix)(out.ys[1])
         return matrix(out.y1[1]), jnp.zeros_like(along).at[order].set(along)
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._numerics._autodiff import frozen
-from .._numerics._root import find_root
+from .._numerics._root import find_root, Newton
 from .._numerics._text import listed, shown
 from .._types import Scalar, StateT, Y
 from ..derivatives._floquet import eigenvalues
@@ -113,35 +113,35 @@ def balance(model: SwitchedSystem, t: Scalar, y: Y, sigma: Array, state: ModeSta
 
 
 @eqx.filter_jit
-def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, max_iterations: int) -> Equilibrium:
+def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, newton: Newton) -> Equilibrium:
     """Newton's method on f(y, s) = 0 in a given mode, with the values of the surfaces that hold the state as unknowns
     beside it, and h = 0 there as their equations."""
     x0, unravel = jfu.ravel_pytree(lax.stop_gradient(y0))
     model = SwitchedSystem(frozen(system), jnp.ones_like(t), t, y0)
     holdable = model.holdable
-    state = nearest_state(model, t, y0, mode)
+    state = model.state_at(t, y0, mode)
 
     def residual(z: tuple, system: System) -> Array:
-        return balance(_with(model, system), t, unravel(z[0]), z[1], state)
+        return balance(model.with_system(system), t, unravel(z[0]), z[1], state)
 
     # Where a surface holds all along it, the values that keep it there are those of the nearest place.
     begin, signs = model.values(t, y0, state), model.signs(t, state)
     sigma = [jnp.where(jnp.isfinite(begin[k]), begin[k], signs[k]) for k in holdable]
     sigma = jnp.stack(sigma) if sigma else jnp.zeros(0, t.dtype)
-    z, converged = find_root(residual, frozen((x0, sigma)), system, tol, max_iterations, well_posed=False)
+    z, converged = find_root(residual, frozen((x0, sigma)), system, newton, well_posed=False)
     still = frozen(z)
     error = jnp.max(jnp.abs(residual(still, frozen(system))))
     whole = jax.jacfwd(lambda z: residual(jfu.ravel_pytree(still)[1](z), frozen(system)))
     singular = jnp.linalg.svd(whole(jfu.ravel_pytree(still)[0]), compute_uv=False)
     isolated = singular[-1] > 1e-10 * singular[0]
 
-    live = _with(model, system)
+    live = model.with_system(system)
     y, s = unravel(z[0]), switch_values(live, t, state, z[1])
     jacobian, motion, held, attracts = linear_motion(live, t, y, state, s)
     roots = free_eigenvalues(motion, held)
     admissible, boundary = _place(model, t, frozen(y), state, frozen(s))
     size = 1 + jnp.max(jnp.abs(z[0]))
-    good = converged & (error <= 1e3 * tol * size)
+    good = converged & (error <= 1e3 * newton.tol * size)
     return Equilibrium(
         system=system,
         y=y,
@@ -157,18 +157,6 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, tol: float, ma
         residual=error,
         result=RESULTS.where(good, RESULTS.successful, RESULTS.equilibrium_not_found),
     )
-
-
-def _with(model: SwitchedSystem, system: System) -> SwitchedSystem:
-    return eqx.tree_at(lambda m: m.system, model, system)
-
-
-def nearest_state(model: SwitchedSystem, t: Scalar, y: Y, mode: tuple) -> ModeState:
-    """The mode, with the component of h nearest to zero where h < 0 or on it, and its least one elsewhere."""
-    parts = [
-        None if n == 1 else jnp.argmin(jnp.stack(model.h(k, t, y))).astype(jnp.int32) for k, n in enumerate(model.parts)
-    ]
-    return ModeState.of(mode, parts)
 
 
 def _surface(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:

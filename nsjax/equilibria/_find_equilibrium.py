@@ -3,7 +3,6 @@
 import itertools
 from typing import Any
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.core
@@ -11,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._numerics._jaxpr import is_constant
+from .._numerics._root import Newton
 from .._types import StateT, Y
-from ..flow._arguments import check_solve
+from ..flow._arguments import checked_start
 from ..flow._results import raise_if, RESULTS
 from ..orbits._orbit import ravel
 from ..system._clock import clock
@@ -59,13 +59,14 @@ def find_equilibrium(
     **Raises:** `ValueError` for a model that time enters; a runtime error if Newton's method does not converge.
     """
     system, y0, t, given, tol = checked_equilibrium(system, y0, t, mode, tol)
-    model = SwitchedSystem(system, jnp.ones_like(t), t, y0)
+    model = SwitchedSystem.forwards(system, t, y0)
     names = [k.name for k in system.switches]
     chosen = tuple(given.get(n, m) for n, m in zip(names, _mode_of(model, t, y0)))
-    found = equilibrium_in(system, t, y0, chosen, tol, max_iterations)
+    newton = Newton(tol, max_iterations)
+    found = equilibrium_in(system, t, y0, chosen, newton)
     concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, y0)))
     if concrete and len(given) < len(names) and not (found.result == RESULTS.successful and found.admissible):
-        others = _in_all_modes(system, model, t, jax.tree.map(lambda x: x[None], y0), given, tol, max_iterations)
+        others = _in_all_modes(system, model, t, jax.tree.map(lambda x: x[None], y0), given, newton)
         others = [other for other in others if other.admissible]
         if others:
             found = min(others, key=lambda other: float(jnp.linalg.norm(ravel(other.y) - ravel(y0))))
@@ -101,8 +102,8 @@ def find_equilibria(
     first = jax.tree.map(lambda x: jnp.asarray(x)[0], starts)
     system, first, t, given, tol = checked_equilibrium(system, first, t, mode, tol)
     starts = jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), starts, first)
-    model = SwitchedSystem(system, jnp.ones_like(t), t, first)
-    found = _in_all_modes(system, model, t, starts, given, tol, max_iterations)
+    model = SwitchedSystem.forwards(system, t, first)
+    found = _in_all_modes(system, model, t, starts, given, Newton(tol, max_iterations))
     distinct: list[Equilibrium] = []
     for one in sorted(found, key=lambda one: (not one.admissible, bool(one.boundary))):
         size = 1 + float(jnp.max(jnp.abs(ravel(one.y))))
@@ -113,7 +114,7 @@ def find_equilibria(
 
 
 def checked_equilibrium(system: System, y0: Y, t: Any, mode: Any, tol: float | None) -> tuple:
-    y0, t, _, _, _, given = check_solve(system, t, t, y0, mode, dfx.Dopri8(), None, dfx.SaveAt(t1=True), 1, 1, None)
+    t, y0, given = checked_start(system, t, y0, mode)
     system = arrays_of(system, t.dtype)
     values = system.values(tuple(jnp.zeros((), t.dtype) for _ in system.switches))
     ticks = any(isinstance(switch, clock) for switch in system.switches)
@@ -153,7 +154,7 @@ def _mode_of(model: SwitchedSystem, t: Any, y: Y) -> list[Any]:
 
 
 def _in_all_modes(
-    system: System, model: SwitchedSystem, t: Any, starts: Y, given: dict[str, Any], tol: float, max_iterations: int
+    system: System, model: SwitchedSystem, t: Any, starts: Y, given: dict[str, Any], newton: Newton
 ) -> list[Equilibrium]:
     """What Newton's method finds from every start in every mode."""
     table = list(itertools.product(*_options(model, given)))
@@ -162,12 +163,12 @@ def _in_all_modes(
     number = len(jax.tree.leaves(starts)[0])
     modes = tuple(jnp.tile(jnp.asarray(column, jnp.int32), number) for column in zip(*table))
     lanes = jax.tree.map(lambda x: jnp.repeat(x, len(table), axis=0), starts)
-    batch = _batch(system, t, lanes, modes, tol, max_iterations)
+    batch = _batch(system, t, lanes, modes, newton)
     arrays, static = eqx.partition(batch, eqx.is_array)
     good = np.flatnonzero(np.asarray(batch.result == RESULTS.successful))
     return [eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static) for i in good]
 
 
 @eqx.filter_jit
-def _batch(system: System, t: Any, starts: Y, modes: tuple, tol: float, max_iterations: int) -> Equilibrium:
-    return jax.vmap(lambda y, mode: equilibrium_in(system, t, y, mode, tol, max_iterations))(starts, modes)
+def _batch(system: System, t: Any, starts: Y, modes: tuple, newton: Newton) -> Equilibrium:
+    return jax.vmap(lambda y, mode: equilibrium_in(system, t, y, mode, newton))(starts, modes)

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from diffrax._root_finder import use_stepsize_tol
 from jax.core import Tracer
 
 from .._numerics._text import components, did_you_mean, known
@@ -16,28 +15,19 @@ from .._types import Scalar, Y
 from ..system._checks import check_direction, check_fields, check_parameters, check_system
 from ..system._system import System
 from ._save import in_order
-from .steppers._exponential import Exponential
 
 
-def check_solve(
-    system: System,
-    t0: Any,
-    t1: Any,
-    y0: Y,
-    mode: Any,
-    solver: Any,
-    controller: Any,
-    saveat: Any,
-    max_steps: Any,
-    max_events: Any,
-    adjoint: Any,
-) -> tuple[Y, Scalar, Scalar, Any, dfx.AbstractStepSizeController, dict[str, Any]]:
-    """Converts and checks the arguments of `solve`."""
+def checked_start(system: System, t: Any, y: Y, mode: Any) -> tuple[Scalar, Y, dict[str, Any]]:
+    """Where a solution sets out, converted and checked: time, state, and the modes that are given."""
     check_system(system)
     check_fields(system)
-    if not isinstance(solver, dfx.AbstractSolver):
-        raise TypeError(f"Argument `solver` must be a diffrax solver such as `diffrax.Tsit5()`, but got {solver!r}.")
-    leaves = jax.tree.leaves(y0, is_leaf=lambda x: x is None)
+    y = checked_state(y)
+    return checked_time("t0", t, jnp.result_type(*jax.tree.leaves(y))), y, given_modes(system, mode)
+
+
+def checked_state(y: Y) -> Y:
+    """A state of arrays of one floating point dtype."""
+    leaves = jax.tree.leaves(y, is_leaf=lambda x: x is None)
     if not leaves:
         raise ValueError("Argument `y0` must hold at least one number, but it is empty.")
     for leaf in leaves:
@@ -56,14 +46,18 @@ def check_solve(
             )
     dtype = jnp.result_type(*leaves)
     dtype = jnp.result_type(float) if all(isinstance(x, float) for x in leaves) else dtype
-    y0 = jax.tree.map(lambda x: jnp.asarray(x, dtype), y0)
-    t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
-    for name, t in (("t0", t0), ("t1", t1)):
-        if t.shape != ():
-            raise ValueError(f"Argument `{name}` must be a scalar, but has shape {t.shape}; use `jax.vmap` for many.")
-    for name, value in (("max_steps", max_steps), ("max_events", max_events)):
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"Argument `{name}` must be a positive integer, but got {value!r}.")
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), y)
+
+
+def checked_time(name: str, t: Any, dtype: Any) -> Scalar:
+    t = jnp.asarray(t, dtype)
+    if t.shape != ():
+        raise ValueError(f"Argument `{name}` must be a scalar, but has shape {t.shape}; use `jax.vmap` for many.")
+    return t
+
+
+def check_span(system: System, t0: Scalar, t1: Scalar, saveat: Any) -> None:
+    """Checks whether a system can be solved from `t0` to `t1`, and what is asked for saved on the way."""
     if not isinstance(saveat, dfx.SaveAt) or not (
         isinstance(saveat.subs, dfx.SubSaveAt) or (saveat.dense and saveat.subs is None)
     ):
@@ -73,13 +67,6 @@ def check_solve(
             raise ValueError(f"Argument `saveat` must not ask for `{name}`, which a flow with events does not have.")
     _check_times(saveat, t0, t1)
     check_direction(system, t1 < t0)
-    if isinstance(solver, Exponential) and isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
-        raise ValueError(
-            "Argument `adjoint` must not be `RecursiveCheckpointAdjoint` for `Exponential`, whose matrix exponential "
-            "is a loop of unknown length; use `diffrax.DirectAdjoint()`."
-        )
-    controller = _controller(controller, dtype)
-    return y0, t0, t1, _implicit(solver, controller, adjoint), controller, _given(system, mode)
 
 
 def check_numbers(system: System, t0: Scalar, t1: Scalar, y0: Y) -> None:
@@ -110,61 +97,8 @@ def _check_times(saveat: dfx.SaveAt, t0: Scalar, t1: Scalar) -> None:
         )
 
 
-def _implicit(solver: Any, controller: Any, adjoint: Any) -> Any:
-    """Gives an implicit solver's root finder the tolerances of the step size controller, and the solver a kind of loop
-    that can be differentiated, as diffrax does."""
-    if not isinstance(solver, dfx.AbstractImplicitSolver):
-        return solver
-    open_ = [n for n in ("rtol", "atol", "norm") if getattr(solver.root_finder, n) is use_stepsize_tol]
-    if open_ and not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
-        raise ValueError(
-            "Argument `stepsize_controller` must be adaptive for an implicit solver whose root finder has no "
-            "tolerances, but got a fixed one. Use `diffrax.PIDController(rtol=..., atol=...)`, or pass "
-            "`root_finder=diffrax.VeryChord(rtol=..., atol=..., norm=optimistix.max_norm)` to the solver."
-        )
-    if getattr(solver, "scan_kind", "") is None and not isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
-        solver = eqx.tree_at(lambda s: s.scan_kind, solver, "lax", is_leaf=lambda x: x is None)
-    return eqx.tree_at(
-        lambda s: [getattr(s.root_finder, n) for n in open_], solver, [getattr(controller, n) for n in open_]
-    )
-
-
-def _controller(controller: Any, dtype: Any) -> dfx.AbstractStepSizeController:
-    eps = float(jnp.finfo(dtype).eps)
-    if controller is None:
-        tol = 1e-8 if eps < 1e-10 else 1e-5
-        return dfx.PIDController(rtol=tol, atol=tol)
-    if not isinstance(controller, dfx.AbstractStepSizeController):
-        raise TypeError(
-            "Argument `stepsize_controller` must be a diffrax step size controller, such as "
-            f"`diffrax.PIDController(rtol=1e-8, atol=1e-8)`, but got {controller!r}."
-        )
-    values = {n: getattr(controller, n, None) for n in ("rtol", "atol")}
-    values = {n: float(x) for n, x in values.items() if eqx.is_array_like(x) and not isinstance(x, Tracer)}
-    for name, value in values.items():
-        if not value >= 0:
-            raise ValueError(f"Argument `stepsize_controller` must have {name} >= 0, but got {name} = {value}.")
-    if len(values) == 2 and not any(values.values()):
-        raise ValueError("Argument `stepsize_controller` must have a tolerance above zero, but rtol = atol = 0.")
-    rtol = getattr(controller, "rtol", None)
-    # A step of size one is rounded by about eps; its error estimate by a few times that. (Inside `jit` the
-    # tolerance may have no value yet.)
-    least = 8 * eps
-    known = eqx.is_array_like(rtol) and not isinstance(rtol, Tracer)
-    if known and 0 < float(rtol) < least:
-        cure = (
-            "Call `jax.config.update('jax_enable_x64', True)` and pass float64 values, or loosen the tolerance."
-            if eps > 1e-10
-            else "Loosen the tolerance."
-        )
-        raise ValueError(
-            f"Argument `stepsize_controller` must have a tolerance that {dtype} can hold (rtol >= {least:.1e}), but "
-            f"got rtol = {float(rtol):.1e}. {cure}"
-        )
-    return controller
-
-
-def _given(system: System, mode: Any) -> dict[str, Any]:
+def given_modes(system: System, mode: Any) -> dict[str, Any]:
+    """The argument `mode`, by the names of the switches."""
     switches = {k.name: k for k in system.switches}
     if mode is None:
         return {}

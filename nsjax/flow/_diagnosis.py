@@ -35,7 +35,7 @@ def explain(system: Any, sol: Solution) -> str:
         )
         text = f"The steps became too small at {where}: {cause}."
     elif result == RESULTS.wrong_contact:
-        model = SwitchedSystem(system, jnp.ones_like(sol.t1), sol.t1, sol.y1)
+        model = SwitchedSystem.forwards(system, sol.t1, sol.y1)
         closes = closing_contacts(model.at(sol.t1), sol.t1, sol.y1)
         name = next((model.switches[k].name for k, bad in closes.items() if bad), "name")
         text = (
@@ -52,7 +52,7 @@ def explain(system: Any, sol: Solution) -> str:
 def _pieces(system: Any, t: Any, y: Y, mode: Any) -> list[tuple[str, list[tuple[str, Any]]]]:
     """What the model's methods return, named."""
     owner, out = type(system).__name__, []
-    model = SwitchedSystem(system, jnp.ones_like(t), t, y)
+    model = SwitchedSystem.forwards(system, t, y)
     state = ModeState.of(mode, [jnp.zeros((), jnp.int32) if n > 1 else None for n in model.parts])
     model = model.within(state.mode)
     for switch in model.switches:

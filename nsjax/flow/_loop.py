@@ -4,6 +4,7 @@ Under `vmap` every lane is in its own mode and at its own time: it takes a step,
 for the segments of the others.
 """
 
+import dataclasses
 import functools as ft
 from typing import Any, NamedTuple
 
@@ -257,8 +258,8 @@ class Flow(eqx.Module):
         if model.slots:
             assert log is not None
             at, news = there.t_after * model.direction, event & there.news
-            row = (at, there.y_before, there.y_after, there.slot, there.state.mode, there.transversality)
-            log = log.write(events, news, *row)
+            slot, mode = there.slot.astype(jnp.int32), jnp.stack(there.state.mode)
+            log = log.write(events, news, (at, there.y_before, there.y_after, slot, mode, there.transversality))
             grazed, forked = grazed | (event & there.grazes), forked | (moved & there.forked)
             events = events + news.astype(jnp.int32)
             halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(step.keep, 0, halted))
@@ -278,16 +279,14 @@ class Flow(eqx.Module):
         few = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(c.t)
         crawled = jnp.where(event | (step.step.t_next - c.t > few), 0, c.crawled + 1)
         result = RESULTS.where((crawled > 64) & ~done, RESULTS.dt_min_reached, result)
-        result = self.verdict(c, step, t, y, f, moved, steps, events, done, result)
-        active = c.active & ~done & (result == RESULTS.successful)
-        return Carry(
+        new = Carry(
             t=t,
             y=y,
             f=f,
             state=state,
             dt=choose(c.active, step.dt, c.dt),
             controller=choose(c.active, step.controller, c.controller),
-            active=active,
+            active=c.active,
             result=result,
             steps=steps,
             accepted=accepted,
@@ -300,8 +299,12 @@ class Flow(eqx.Module):
             margin=jnp.minimum(c.margin, jnp.where(c.active, there.margin, jnp.inf)),
             log=log,
             saved=self.save(c, there, moved, accepted),
-            meter=self.meter.step(c.meter, jnp.where(active, (t - self.t0) / (self.t1 - self.t0), 1.0)),
+            meter=c.meter,
         )
+        result = self.verdict(c, new, step, moved, done)
+        active = c.active & ~done & (result == RESULTS.successful)
+        meter = self.meter.step(c.meter, jnp.where(active, (t - self.t0) / (self.t1 - self.t0), 1.0))
+        return dataclasses.replace(new, active=active, result=result, meter=meter)
 
     def ends(self, there: Transition) -> Bool[Array, ""]:
         """Whether an event is one that ends the solution: of an impact, that is not a lift-off."""
@@ -316,38 +319,26 @@ class Flow(eqx.Module):
 
     def save(self, c: Carry, there: Transition, moved: Bool[Array, ""], accepted: Int[Array, ""]) -> Saved:
         """What `saveat` asks for of this turn; at an event the states before and after it."""
-        system, direction = self.model.system, self.model.direction
-        saved = c.saved
+        model, saved = self.model, c.saved
         if saved.request.ts is not None:
-            saved = saved.write_times(moved, c.t, there.t, there.points, c.state.mode, system, direction, self.reverse)
+            saved = saved.write_times(moved, (c.t, there.t), there.points, c.state.mode, model, self.reverse)
         saved = saved.write_step(moved, c.accepted, c.t, there.t, there.points)
         if self.keep_steps:
             due = moved & ((accepted % self.keep_steps == 0) | there.found)
-            saved = saved.write(due, there.t, there.y_before, c.state.mode, system, direction)
+            saved = saved.write(due, there.t, there.y_before, c.state.mode, model)
             after = (there.t_after, there.y_after, there.state.mode)
-            saved = saved.write(due & there.found, *after, system, direction)
+            saved = saved.write(due & there.found, *after, model)
         return saved
 
-    def verdict(
-        self,
-        c: Carry,
-        step: _Attempt,
-        t: Scalar,
-        y: Y,
-        f: Y,
-        moved: Bool[Array, ""],
-        steps: Int[Array, ""],
-        events: Int[Array, ""],
-        done: Bool[Array, ""],
-        result: RESULTS,
-    ) -> RESULTS:
+    def verdict(self, c: Carry, new: Carry, step: _Attempt, moved: Bool[Array, ""], done: Bool[Array, ""]) -> RESULTS:
         """Whether the lane can go on."""
+        t, result = new.t, new.result
         good = result == RESULTS.successful
-        result = RESULTS.where((steps >= self.max_steps) & ~done & good, RESULTS.max_steps_reached, result)
+        result = RESULTS.where((new.steps >= self.max_steps) & ~done & good, RESULTS.max_steps_reached, result)
         if self.model.slots:
-            full = (events >= self.max_events) & ~done & (result == RESULTS.successful)
+            full = (new.events >= self.max_events) & ~done & (result == RESULTS.successful)
             result = RESULTS.where(full, RESULTS.max_events_reached, result)
-        result = RESULTS.where(~finite((y, f)), RESULTS.nonfinite_field, result)
+        result = RESULTS.where(~finite((new.y, new.f)), RESULTS.nonfinite_field, result)
         # Rejected again and again, down to nothing: at a place where the field ends, or where it is too rough.
         least = 1e-6 * float(jnp.finfo(t.dtype).eps) * (self.t1 - self.t0)
         tiny = ~moved & ((t + step.dt <= t) | (step.dt <= least)) & (result == RESULTS.successful)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Scalar, Y
+from ..system._model import SwitchedSystem
 from .steppers._stepper import bernstein
 
 
@@ -71,13 +72,12 @@ class Log(eqx.Module):
         self.modes = jnp.full((capacity, switches), NO_MODE, jnp.int32)
         self.transversality = jnp.full(capacity, jnp.nan, dtype)
 
-    def write(
-        self, index: Any, when: Any, t: Scalar, before: Y, after: Y, slot: Any, mode: tuple, transversality: Scalar
-    ) -> "Log":
+    def write(self, index: Any, when: Any, row: tuple) -> "Log":
+        """Writes a row, which has an entry for each column, if `when`."""
+
         def columns(log: Log) -> tuple:
             return log.t, log.before, log.after, log.slot, log.modes, log.transversality
 
-        row = (t, before, after, slot.astype(jnp.int32), jnp.stack(mode), transversality)
         return eqx.tree_at(columns, self, _put(columns(self), index, row, when))
 
 
@@ -95,14 +95,14 @@ class Saved(eqx.Module):
     def __init__(
         self,
         saveat: dfx.SaveAt,
-        max_steps: int,
-        max_events: int,
+        most: tuple[int, int],
         t: Scalar,
         y: Y,
         mode: tuple,
         degree: int,
-        system: Any,
+        model: SwitchedSystem,
     ):
+        max_steps, max_events = most
         request = Request.of(saveat)
         self.request = request
         self.count = jnp.zeros((), jnp.int32)
@@ -110,7 +110,7 @@ class Saved(eqx.Module):
         times = 0 if request.ts is None else len(request.ts)
         steps = (max_steps + 2 * max_events) // request.steps if request.steps else 0
         size = int(request.t0) + times + int(request.t1) + steps
-        out = jax.eval_shape(lambda: request.fn(t, y, system))
+        out = jax.eval_shape(lambda: request.fn(t, y, model.system))
         self.ts = jnp.full(size, jnp.inf, t.dtype)
         self.ys = jax.tree.map(
             lambda x: jnp.full((size, *x.shape), jnp.inf if jnp.issubdtype(x.dtype, jnp.inexact) else 0, x.dtype), out
@@ -121,9 +121,10 @@ class Saved(eqx.Module):
             points = jax.tree.map(lambda x: jnp.zeros((max_steps, degree + 1, *x.shape), x.dtype), y)
             self.dense = (jnp.zeros(max_steps, t.dtype), jnp.full(max_steps, jnp.inf, t.dtype), points)
 
-    def write(self, when: Any, t: Scalar, y: Y, mode: tuple, system: Any, direction: Any) -> "Saved":
+    def write(self, when: Any, t: Scalar, y: Y, mode: tuple, model: SwitchedSystem) -> "Saved":
         mode_row = jnp.stack(mode) if mode else jnp.zeros(0, jnp.int32)
-        row = (t * direction, self.request.fn(t * direction, y, system), mode_row)
+        t = t * model.direction
+        row = (t, self.request.fn(t, y, model.system), mode_row)
         new = _put((self.ts, self.ys, self.modes), self.count, row, when)
         return eqx.tree_at(
             lambda s: (s.ts, s.ys, s.modes, s.count), self, (*new, self.count + jnp.asarray(when, jnp.int32))
@@ -132,19 +133,18 @@ class Saved(eqx.Module):
     def write_times(
         self,
         when: Bool[Array, ""],
-        t0: Scalar,
-        t1: Scalar,
+        step: tuple[Scalar, Scalar],
         points: Y,
         mode: tuple,
-        system: Any,
-        direction: Any,
+        model: SwitchedSystem,
         reverse: bool,
     ) -> "Saved":
-        """Saves every requested time up to `t1`, from the dense output of the step (t0, t1)."""
+        """Saves every requested time up to the end of a step, from its dense output."""
+        t0, t1 = step
         times = self.request.ts
         if times is None:
             return self
-        times = times.astype(t0.dtype) * direction
+        times = times.astype(t0.dtype) * model.direction
         last = len(times) - 1
 
         def due(saved: Saved) -> Bool[Array, ""]:
@@ -155,7 +155,7 @@ class Saved(eqx.Module):
             now, t = due(saved), times[jnp.minimum(saved.next, last)]
             length = t1 - t0
             u = jnp.where(length > 0, (t - t0) / jnp.where(length > 0, length, 1), 1)
-            saved = saved.write(now, t, bernstein(points, u), mode, system, direction)
+            saved = saved.write(now, t, bernstein(points, u), mode, model)
             return eqx.tree_at(lambda s: s.next, saved, saved.next + now.astype(jnp.int32))
 
         dynamic, static = eqx.partition(self, eqx.is_array)

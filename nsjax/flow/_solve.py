@@ -21,11 +21,12 @@ from ..system._checks import check_model, closing_contacts
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, System
-from ._arguments import check_numbers, check_solve
+from ._arguments import check_numbers, check_span, checked_start, checked_time, given_modes
 from ._diagnosis import explain
+from ._integrator import Integrator
 from ._loop import Carry, finite, Flow
 from ._results import is_okay, raise_if, RESULTS, SolveError
-from ._save import in_order, Log, Saved
+from ._save import in_order, Log, Request, Saved
 from ._solution import Events, Solution
 from .events._initial_mode import start_mode
 from .steppers._exponential import Exponential, ExponentialStepper
@@ -34,18 +35,14 @@ from .steppers._taylor import Taylor, TaylorStepper
 
 
 class _Options(NamedTuple):
-    """The arguments of `solve` that say how, and not what."""
+    """The arguments of `solve` apart from the problem."""
 
-    given: dict[str, Any]
-    solver: dfx.AbstractSolver
-    controller: dfx.AbstractStepSizeController
+    given: dict[str, Any]  # modes, by the names of switches
+    integrator: Integrator
     saveat: dfx.SaveAt
-    dt0: Scalar | None
-    max_steps: int
-    max_events: int
-    adjoint: dfx.AbstractAdjoint
-    throw: bool
-    meter: dfx.AbstractProgressMeter
+    dt0: Scalar | None = None
+    throw: bool = False
+    meter: dfx.AbstractProgressMeter = dfx.NoProgressMeter()
 
 
 @eqx.filter_jit
@@ -53,9 +50,9 @@ def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> So
     def run(system: System, t0: Scalar, t1: Scalar, y0: Y) -> Solution:
         return _integrate(system, t0, t1, y0, options)
 
-    if isinstance(options.adjoint, dfx.DirectAdjoint):
+    if isinstance(options.integrator.adjoint, dfx.DirectAdjoint):
         return dense_jacobian(run, system, t0, t1, y0)
-    if not isinstance(options.adjoint, dfx.RecursiveCheckpointAdjoint):
+    if not isinstance(options.integrator.adjoint, dfx.RecursiveCheckpointAdjoint):
         system, t0, t1, y0 = forward_only(
             (system, t0, t1, y0),
             "`nsjax.solve` was differentiated in reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`), which needs "
@@ -66,70 +63,92 @@ def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> So
 
 
 def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> Solution:
-    given, solver, controller, saveat, dt0, max_steps, max_events, adjoint, throw, meter = options
-    reverse = isinstance(adjoint, dfx.RecursiveCheckpointAdjoint)
     direction = jnp.where(t1 >= t0, 1, -1).astype(t0.dtype)
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
     model = SwitchedSystem(system, direction, start, y0).at(start)
-    max_events = max_events if model.slots else 0
-    state, forked, result = start_mode(model, start, y0, given, frozen(stop - start))
-    stepper = _stepper(solver).made_for(model, state, start, y0)
+    state, forked, result = start_mode(model, start, y0, options.given, frozen(stop - start))
+    stepper = _stepper(options.integrator.solver).made_for(model, state, start, y0)
     y0 = model.project(start, y0, state)  # a change of y0 off the surface that holds it changes nothing
-    f0 = model.flow(start, y0, state)
+    flow = _flow(model, stepper, (start, stop), y0, state, options)
+    result = _obstacle(flow, y0, state, options.saveat, result)
+    carry = _first_turn(flow, y0, state, forked, result, options)
+    c = _looped(flow, _tied(jax.tree.map(_strong, carry), (system, t0, t1, y0)), options.integrator.adjoint)
+    sol = _solution(flow, c, t0, state, Request.of(options.saveat).t1)
+    if options.throw:
+        # (What is transposed has been computed before.)
+        failed = ~is_okay(sol.result)
+        sol = sol.result.error_if(sol, failed) if flow.reverse else raise_if(failed, sol.result, sol)
+    return sol
 
-    slots = range(len(model.slots))
+
+def _flow(
+    model: SwitchedSystem, stepper: Stepper, span: tuple[Scalar, Scalar], y: Y, state: ModeState, options: _Options
+) -> Flow:
+    """What stays the same in all turns of the loop; of each guard whether it is affine, and whether it may jump."""
+    integrator, request = options.integrator, Request.of(options.saveat)
+    t, slots = span[0], range(len(model.slots))
 
     def guard(i: int, ty: tuple[Scalar, Y]) -> list[Scalar]:
         return model.guards(*ty, state, wanted=tuple(j == i for j in slots))[i]
 
-    affine = tuple(is_affine(ft.partial(guard, i), (start, y0)) for i in slots)
-    jumpy = tuple(not affine[i] and may_jump(ft.partial(guard, i), (start, y0)) for i in slots)
-    terms = dfx.ODETerm(lambda t, y, args: model.flow(t, y, state))
-    func: Any = solver.func
-    first, controller_state = controller.init(terms, start, stop, y0, dt0, None, func, solver.error_order(terms))
-    saved = Saved(saveat, max_steps, max_events, start, y0, state.mode, stepper.degree, system)
-    request = saved.request
-    if request.t0:
-        saved = saved.write(True, start, y0, state.mode, system, direction)
-    if request.ts is not None:
-        blank = jax.tree.map(lambda x: jnp.stack([x] * (stepper.degree + 1)), y0)
-        saved = saved.write_times(jnp.ones((), bool), start, start, blank, state.mode, system, direction, reverse)
-    flow = Flow(
+    affine = tuple(is_affine(ft.partial(guard, i), (t, y)) for i in slots)
+    return Flow(
         model=model,
         stepper=stepper,
-        controller=controller,
-        t0=start,
-        t1=stop,
-        max_steps=max_steps,
-        max_events=max_events,
+        controller=integrator.stepsize_controller,
+        t0=span[0],
+        t1=span[1],
+        max_steps=integrator.max_steps,
+        max_events=integrator.max_events if model.slots else 0,
         keep_steps=request.steps,
-        want_points=saveat.dense or request.ts is not None,
-        meter=meter,
+        want_points=options.saveat.dense or request.ts is not None,
+        meter=options.meter,
         affine=affine,
-        jumpy=jumpy,
-        reverse=reverse,
+        jumpy=tuple(not affine[i] and may_jump(ft.partial(guard, i), (t, y)) for i in slots),
+        reverse=isinstance(integrator.adjoint, dfx.RecursiveCheckpointAdjoint),
     )
-    for _, _, good, _ in [law for switch in model.switches for law in switch.laws(system)]:
+
+
+def _obstacle(flow: Flow, y: Y, state: ModeState, saveat: dfx.SaveAt, result: RESULTS) -> RESULTS:
+    """What keeps a solution from setting out, if anything does."""
+    model, t0, t1, ts = flow.model, flow.t0, flow.t1, Request.of(saveat).ts
+    for _, _, good, _ in [law for switch in model.switches for law in switch.laws(model.system)]:
         result = RESULTS.where(good, result, RESULTS.wrong_parameter)
     for t in (t0, t1) if model.clocks else ():
-        result = RESULTS.where(model.countable(t), result, RESULTS.clock_too_fast)
-    for closes in closing_contacts(model, start, y0).values():
+        result = RESULTS.where(model.countable(t * model.direction), result, RESULTS.clock_too_fast)
+    for closes in closing_contacts(model, t0, y).values():
         result = RESULTS.where(closes, RESULTS.wrong_contact, result)
-    zero = jnp.zeros((), jnp.int32)
-    bad = ~finite((y0, f0, start, stop))
-    result = RESULTS.where(bad, RESULTS.nonfinite_field, result)
-    if request.ts is not None and len(request.ts):
-        ordered = in_order(request.ts.astype(t0.dtype), t0, t1)
+    good = finite((y, model.flow(t0, y, state), t0, t1))
+    result = RESULTS.where(good, result, RESULTS.nonfinite_field)
+    if ts is not None and len(ts):
+        ordered = in_order(ts.astype(t0.dtype), t0 * model.direction, t1 * model.direction)
         result = RESULTS.where(ordered, result, RESULTS.wrong_save_times)
-    carry = Carry(
-        t=start,
-        y=y0,
-        f=f0,
+    return result
+
+
+def _first_turn(flow: Flow, y: Y, state: ModeState, forked: Any, result: RESULTS, options: _Options) -> Carry:
+    """What the loop begins with."""
+    model, stepper, controller, t = flow.model, flow.stepper, flow.controller, flow.t0
+    terms = dfx.ODETerm(lambda t, y, args: model.flow(t, y, state))
+    solver: Any = options.integrator.solver
+    order = solver.error_order(terms)
+    first, controller_state = controller.init(terms, t, flow.t1, y, options.dt0, None, solver.func, order)
+    saved = Saved(options.saveat, (flow.max_steps, flow.max_events), t, y, state.mode, stepper.degree, model)
+    if saved.request.t0:
+        saved = saved.write(True, t, y, state.mode, model)
+    if saved.request.ts is not None:
+        blank = jax.tree.map(lambda x: jnp.stack([x] * (stepper.degree + 1)), y)
+        saved = saved.write_times(jnp.ones((), bool), (t, t), blank, state.mode, model, flow.reverse)
+    zero = jnp.zeros((), jnp.int32)
+    return Carry(
+        t=t,
+        y=y,
+        f=model.flow(t, y, state),
         state=state,
-        dt=lax.stop_gradient(first - start),
+        dt=lax.stop_gradient(first - t),
         controller=controller_state,
-        active=(start < stop) & (result == RESULTS.successful),
+        active=(t < flow.t1) & (result == RESULTS.successful),
         result=result,
         steps=zero,
         accepted=zero,
@@ -139,60 +158,64 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
         crawled=zero,
         grazed=jnp.zeros((), bool),
         forked=forked,
-        margin=jnp.full_like(start, jnp.inf),
-        log=Log(max_events, y0, len(model.switches)) if model.slots else None,
+        margin=jnp.full_like(t, jnp.inf),
+        log=Log(flow.max_events, y, len(model.switches)) if model.slots else None,
         saved=saved,
-        meter=meter.init(),
+        meter=flow.meter.init(),
     )
-    carry = _tied(jax.tree.map(_strong, carry), (system, t0, t1, y0))
+
+
+def _looped(flow: Flow, carry: Carry, adjoint: dfx.AbstractAdjoint) -> Carry:
+    """The end of the loop."""
     dynamic, static = eqx.partition(carry, eqx.is_array)
 
     def body(dynamic: Any) -> Any:
         new = eqx.filter(flow.body(eqx.combine(dynamic, static)), eqx.is_array)
         return jax.tree.map(lambda old, x: x.astype(old.dtype), dynamic, new)
 
-    # `unvmap_any` keeps the predicate unbatched, so that ended lanes cost no copy of the buffers.
     kind = dict(kind="lax")
     if isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
-        kind = dict(kind="checkpointed", max_steps=max_steps, checkpoints=adjoint.checkpoints)
+        kind = dict(kind="checkpointed", max_steps=flow.max_steps, checkpoints=adjoint.checkpoints)
+    # `unvmap_any` keeps the predicate unbatched, so that ended lanes cost no copy of the buffers.
     dynamic = eqxi.while_loop(lambda c: eqxi.unvmap_any(c.active), body, dynamic, **kind)
     c: Carry = eqx.combine(dynamic, static)
-    meter.close(c.meter)
+    flow.meter.close(c.meter)
+    return c
+
+
+def _solution(flow: Flow, c: Carry, t0: Scalar, first: ModeState, end_wanted: bool) -> Solution:
+    """The solution from `t0`, in the mode `first`, to where the loop has ended."""
+    model, stop = flow.model, flow.t1
     # After an event at the very end the solution has no time left, but it moves with the difference of the two times.
     ended = c.t == stop
     late = jnp.where(ended, stop - c.t, 0)
     y1, t_end = jax.tree.map(lambda y, f: y + jnp.where(ended, f, 0) * late, c.y, c.f), c.t + late
-    result = RESULTS.where(c.grazed & (c.result == RESULTS.successful), RESULTS.tangential_event, c.result)
     saved = c.saved
-    if request.t1:
-        saved = saved.write(True, t_end, y1, c.state.mode, system, direction)
-    sol = Solution(
-        system=system,
+    if end_wanted:
+        saved = saved.write(True, t_end, y1, c.state.mode, model)
+    return Solution(
+        system=model.system,
         t0=t0,
-        t1=t_end * direction,
-        mode0=_row(state.mode),
+        t1=t_end * model.direction,
+        mode0=_row(first.mode),
         y1=y1,
         mode1=_row(c.state.mode),
         ts=saved.ts,
         ys=saved.ys,
         modes=saved.modes,
-        events=_events(model, c, state),
+        events=_events(model, c, first),
         stats={
             "num_steps": c.steps,
             "num_accepted_steps": c.accepted,
             "num_rejected_steps": c.steps - c.accepted,
             "num_events": c.events,
-            "max_steps": max_steps,
+            "max_steps": flow.max_steps,
         },
-        result=result,
+        result=RESULTS.where(c.grazed & (c.result == RESULTS.successful), RESULTS.tangential_event, c.result),
         unique=~c.forked,
         margin=c.margin,
-        dense=None if saved.dense is None else (*saved.dense, direction, c.accepted),
+        dense=None if saved.dense is None else (*saved.dense, model.direction, c.accepted),
     )
-    if throw:
-        # (What is transposed has been computed before.)
-        sol = result.error_if(sol, ~is_okay(result)) if reverse else raise_if(~is_okay(result), result, sol)
-    return sol
 
 
 def _stepper(solver: Any) -> Stepper:
@@ -312,27 +335,21 @@ def solve(
     **Raises:** `TypeError`, `ValueError` for mistakes in the model or the arguments; a runtime error that tells which
     of `RESULTS` occurred, if `throw`.
     """
-    y0, t0, t1, solver, controller, given = check_solve(
-        system, t0, t1, y0, mode, solver, stepsize_controller, saveat, max_steps, max_events, adjoint
-    )
+    t0, y0, given = checked_start(system, t0, y0, mode)
+    t1 = checked_time("t1", t1, t0.dtype)
+    check_span(system, t0, t1, saveat)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint).checked(t0.dtype)
     if throw:
         check_numbers(system, t0, t1, y0)
     system = arrays_of(system, t0.dtype)
-    # Tolerances are numbers too: a new one is no new program.
-    plain = [n for n in ("rtol", "atol") if isinstance(getattr(controller, n, None), (int, float))]
-    controller = eqx.tree_at(
-        lambda c: [getattr(c, n) for n in plain],
-        controller,
-        [jnp.asarray(getattr(controller, n), t0.dtype) for n in plain],
-    )
+    integrator = integrator.with_arrays(t0.dtype)
     if dt0 is not None:
         if known(dt0) and not np.all(np.asarray(dt0) > 0):
             raise ValueError(f"Argument `dt0` must be a time above zero, whatever the direction, but got {dt0}.")
         dt0 = jnp.abs(jnp.asarray(dt0, t0.dtype))
-    told = throw and known((system, t0, t1, y0, given, controller, saveat, dt0))
+    told = throw and known((system, t0, t1, y0, given, integrator, saveat, dt0))
     within = throw and not told  # raised by the compiled program itself
-    options = _Options(given, solver, controller, saveat, dt0, max_steps, max_events, adjoint, within, progress_meter)
-    sol = _run(system, t0, t1, y0, options)
+    sol = _run(system, t0, t1, y0, _Options(given, integrator, saveat, dt0, within, progress_meter))
     if not told:
         return sol
     if not known(sol.result):  # numbers that are known, within a function that is being compiled
@@ -340,3 +357,18 @@ def solve(
     if not is_okay(sol.result):
         raise SolveError(explain(system, sol))
     return sol
+
+
+def integrate(
+    system: System,
+    t0: Scalar,
+    t1: Scalar,
+    y0: Y,
+    integrator: Integrator,
+    *,
+    mode: Any = None,
+    saveat: dfx.SaveAt = dfx.SaveAt(t1=True),
+) -> Solution:
+    """`solve` for arguments that have been checked, which never raises."""
+    options = _Options(given_modes(system, mode), integrator.with_arrays(t0.dtype), saveat)
+    return _run(arrays_of(system, t0.dtype), t0, jnp.asarray(t1, t0.dtype), y0, options)

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from .._numerics._text import between, shown, written
 from .._types import Scalar, Y
-from ..flow._arguments import check_solve
+from ..flow._arguments import checked_start
+from ..flow._integrator import Integrator
 from ..flow._results import outcomes, RESULTS
 from ..orbits._orbit import ravel
 from ..sweeps._sweep import sweep
@@ -167,19 +168,17 @@ def brute_force(
             f"are {', '.join(str(jnp.shape(leaf)) for leaf in jax.tree.leaves(starts))}."
         )
     one = jax.tree.map(lambda x: x[0], starts)
-    y0, t0, _, solver, controller, _ = check_solve(
-        system, t0, t0, one, None, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events, None
-    )
+    t0, y0, _ = checked_start(system, t0, one, None)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype)
     path = parameter_path(system, parameter)
     system = arrays_of(system, t0.dtype)
     values = jnp.asarray(values, t0.dtype)
     if values.ndim != 1 or not len(values):
         raise ValueError(f"Argument `values` must be a vector, but its shape is {values.shape}.")
-    how = dict(solver=solver, stepsize_controller=controller, max_steps=max_steps, max_events=max_events)
     if section is None:
-        step = phase_map(system, 1, how)
+        step = phase_map(system, 1, integrator)
     else:
-        step = section_map(system, section, direction, max_time, t0, y0, how)
+        step = section_map(system, section, direction, max_time, t0, y0, integrator)
     starts = jax.tree.map(lambda x: jnp.asarray(x, t0.dtype), starts)
     number = len(jax.tree.leaves(starts)[0])
     args = (system, path, step, t0, values, transient, keep)

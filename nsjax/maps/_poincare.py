@@ -20,9 +20,10 @@ from jaxtyping import Array, Float, Int
 from .._numerics._autodiff import frozen
 from .._numerics._text import between, listed, shown, written
 from .._types import Scalar, Y
-from ..flow._arguments import check_solve
+from ..flow._arguments import checked_start
+from ..flow._integrator import Integrator
 from ..flow._results import is_okay, outcomes, raise_if, RESULTS
-from ..flow._solve import solve
+from ..flow._solve import integrate
 from ..flow.events._initial_mode import AT_ONCE, start_mode
 from ..system._checks import check_model, check_system
 from ..system._clock import clock
@@ -123,7 +124,7 @@ class Start(NamedTuple):
 class PoincareMap(eqx.Module):
     """A Poincaré map, applied over and over."""
 
-    how: dict[str, Any]  # arguments of `solve`
+    integrator: Integrator
 
     @abc.abstractmethod
     def flow_of(self, system: System) -> System:
@@ -213,7 +214,7 @@ class _Section(PoincareMap):
 
     def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
         end = t + self.max_time
-        sol = solve(system, t, end, y, mode=mode, throw=False, **self.how)
+        sol = integrate(system, t, end, y, self.integrator, mode=mode)
         late = is_okay(sol.result) & ~(sol.t1 < end)
         y1 = sol.y1
         for switch in system.switches:
@@ -249,7 +250,7 @@ class _Phase(PoincareMap):
     def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
         # Each time from t0, so that time does not lose digits.
         period = self.horizon(system, t)
-        sol = solve(system, t0, t0 + period, y, mode=mode or None, throw=False, **self.how)
+        sol = integrate(system, t0, t0 + period, y, self.integrator, mode=mode or None)
         return t + period, sol.y1, sol.mode1, sol.result
 
 
@@ -264,7 +265,7 @@ def positive(name: str, value: Any) -> None:
 
 
 def section_map(
-    system: System, section: Section, direction: int, max_time: Any, t: Scalar, y: Y, how: dict[str, Any]
+    system: System, section: Section, direction: int, max_time: Any, t: Scalar, y: Y, integrator: Integrator
 ) -> PoincareMap:
     """The map of a section, after a look at the arguments that make it."""
     owner = type(system).__name__
@@ -307,13 +308,13 @@ def section_map(
         )
     time = jnp.asarray(system.period, t.dtype) * PERIODS if max_time is None else jnp.asarray(max_time, t.dtype)
     if isinstance(section, str):
-        return _Section(how, None, section, direction, time)
+        return _Section(integrator, None, section, direction, time)
     # A plain function is no array, nor has it any: it belongs to the structure.
     plain = jax.tree.leaves(section) == [section]
-    return _Section(how, jax.tree_util.Partial(section) if plain else section, None, direction, time)
+    return _Section(integrator, jax.tree_util.Partial(section) if plain else section, None, direction, time)
 
 
-def phase_map(system: System, order: int, how: dict[str, Any]) -> PoincareMap:
+def phase_map(system: System, order: int, integrator: Integrator) -> PoincareMap:
     """The map over periods of the forcing."""
     check_system(system)
     positive("order", order)
@@ -322,39 +323,31 @@ def phase_map(system: System, order: int, how: dict[str, Any]) -> PoincareMap:
             f"Argument `system` must be forced for a map over its period, but `{type(system).__name__}.period` is "
             "None. For an autonomous system take `nsjax.poincare_map` with a section."
         )
-    return _Phase(how, order)
+    return _Phase(integrator, order)
 
 
 @eqx.filter_jit
 def _apply(
-    step: PoincareMap, system: System, t0: Scalar, y0: Y, given: dict[str, Any], number: int, each: int, single: bool
+    step: PoincareMap, system: System, t0: Scalar, y0: Y, given: dict[str, Any], number: int | None, each: int
 ) -> Iterate:
-    rows = step.iterates(system, step.start(system, t0, y0, given), number, each)
-    return jax.tree.map(lambda x: x[0], rows) if single else rows
+    rows = step.iterates(system, step.start(system, t0, y0, given), number or 1, each)
+    return jax.tree.map(lambda x: x[0], rows) if number is None else rows
 
 
 def _iterated(
-    make: Callable[[System, Scalar, Y, dict], PoincareMap],
+    make: Callable[[System, Scalar, Y], PoincareMap],
     system: System,
-    y0: Y,
-    t0: Any,
-    mode: Any,
+    start: tuple[Any, Y, Any],
     iterates: int | None,
     each: int,
-    how: dict[str, Any],
     throw: bool,
 ) -> Iterate:
-    """Checks what the two maps have in common, and applies them."""
+    """Checks what the two maps have in common, and applies them from a `start`: time, state, mode."""
     if iterates is not None:
         positive("iterates", iterates)
-    saveat, bounds = dfx.SaveAt(t1=True), (how["max_steps"], how["max_events"])
-    check_system(system)
-    y0, t0, _, solver, controller, given = check_solve(
-        system, t0, t0, y0, mode, how["solver"], how["stepsize_controller"], saveat, *bounds, how["adjoint"]
-    )
+    t0, y0, given = checked_start(system, *start)
     system = arrays_of(system, t0.dtype)
-    step = make(system, t0, y0, how | dict(solver=solver, stepsize_controller=controller))
-    out = _apply(step, system, t0, y0, given, iterates or 1, each, iterates is None)
+    out = _apply(make(system, t0, y0), system, t0, y0, given, iterates, each)
     if throw:
         last = jax.tree.map(lambda x: x if iterates is None else x[-1], out.result)
         out = raise_if(~is_okay(last), last, out)
@@ -418,18 +411,12 @@ def poincare_map(
     return.
     """
     positive("number", number)
-    how = dict(
-        solver=solver,
-        stepsize_controller=stepsize_controller,
-        max_steps=max_steps,
-        max_events=max_events,
-        adjoint=adjoint,
-    )
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint)
 
-    def make(system: System, t: Scalar, y: Y, how: dict[str, Any]) -> PoincareMap:
-        return section_map(system, section, direction, max_time, t, y, how)
+    def make(system: System, t: Scalar, y: Y) -> PoincareMap:
+        return section_map(system, section, direction, max_time, t, y, integrator.checked(t.dtype))
 
-    return _iterated(make, system, y0, t0, mode, iterates, number, how, throw)
+    return _iterated(make, system, (t0, y0, mode), iterates, number, throw)
 
 
 def stroboscopic_map(
@@ -465,15 +452,9 @@ def stroboscopic_map(
 
     **Raises:** `ValueError` for an autonomous system; a runtime error where `solve` fails.
     """
-    how = dict(
-        solver=solver,
-        stepsize_controller=stepsize_controller,
-        max_steps=max_steps,
-        max_events=max_events,
-        adjoint=adjoint,
-    )
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint)
 
-    def make(system: System, t: Scalar, y: Y, how: dict[str, Any]) -> PoincareMap:
-        return phase_map(system, order, how)
+    def make(system: System, t: Scalar, y: Y) -> PoincareMap:
+        return phase_map(system, order, integrator.checked(t.dtype))
 
-    return _iterated(make, system, y0, t0, mode, iterates, 1, how, throw)
+    return _iterated(make, system, (t0, y0, mode), iterates, 1, throw)

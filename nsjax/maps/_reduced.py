@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._numerics._root import find_root
+from .._numerics._root import find_root, Newton
 from .._numerics._text import between, shown, written
 from .._types import Scalar, Y
-from ..flow._arguments import check_solve
+from ..flow._arguments import checked_start
+from ..flow._integrator import Integrator
 from ..flow._results import is_okay, outcomes, raise_if, RESULTS
-from ..flow._solve import solve
+from ..flow._solve import integrate
 from ..system._system import arrays_of, System
 from ._poincare import phase_map, unless_failed
 
@@ -108,37 +109,32 @@ def reduced_map(
     **Raises:** `ValueError` for an autonomous system or an unknown component; a runtime error if no such state is
     found.
     """
-    y0, t0, _, solver, controller, given = check_solve(
-        system, t0, t0, guess, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events, None
-    )
-    double = bool(jnp.finfo(t0.dtype).eps < 1e-10)
-    if stepsize_controller is None:
-        small = 1e-12 if double else 1e-6
-        controller = dfx.PIDController(rtol=small, atol=small)
-    tol = (1e-10 if double else 1e-4) if tol is None else tol
+    t0, y0, given = checked_start(system, t0, guess, mode)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, (1e-12, 1e-6))
+    tol = (1e-10 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4) if tol is None else tol
     x = jnp.asarray(x, t0.dtype)
     if x.shape != ():
         raise ValueError(f"Argument `x` must be a scalar, but has shape {x.shape}; use `nsjax.sweep` for many.")
-    how = dict(solver=solver, stepsize_controller=controller, max_steps=max_steps, max_events=max_events)
-    phase_map(system, order, how)
+    phase_map(system, order, integrator)
     system = arrays_of(system, t0.dtype)
-    out = _reduced(system, x, t0, y0, given or None, _place(y0, component), order, how, tol, max_iterations)
+    span = _Span(given or None, order, integrator)
+    out = _reduced((system, t0, x), y0, _place(y0, component), span, Newton(tol, max_iterations))
     return raise_if(~is_okay(out.result), out.result, out) if throw else out
+
+
+class _Span(NamedTuple):
+    """How a solution is followed over so many periods of the forcing."""
+
+    mode: Any
+    order: int
+    integrator: Integrator
 
 
 @eqx.filter_jit
 def _reduced(
-    system: System,
-    x: Scalar,
-    t0: Scalar,
-    guess: Y,
-    given: Any,
-    place: int,
-    order: int,
-    how: dict[str, Any],
-    tol: float,
-    max_iterations: int,
+    parameters: tuple[System, Scalar, Scalar], guess: Y, place: int, span: _Span, newton: Newton
 ) -> ReducedIterate:
+    x = parameters[-1]
     flat, unravel = jfu.ravel_pytree(guess)
 
     def state(others: Array, x: Scalar) -> Y:
@@ -146,20 +142,19 @@ def _reduced(
 
     def advance(others: Array, parameters: tuple) -> tuple[Array, RESULTS]:
         system, t0, x = parameters
-        end = t0 + jnp.asarray(system.period, t0.dtype) * order
-        sol = solve(system, t0, end, state(others, x), mode=given, throw=False, **how)
+        end = t0 + jnp.asarray(system.period, t0.dtype) * span.order
+        sol = integrate(system, t0, end, state(others, x), span.integrator, mode=span.mode)
         # Newton's method must not be led by a solution that ended early.
         return jnp.where(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0], jnp.nan), sol.result
 
     def residual(others: Array, parameters: tuple) -> Array:
         return jnp.delete(advance(others, parameters)[0], place, assume_unique_indices=True) - others
 
-    parameters = (system, t0, x)
     others = jnp.delete(flat, place, assume_unique_indices=True)
-    others, converged = find_root(residual, others, parameters, tol, max_iterations)
+    others, converged = find_root(residual, others, parameters, newton)
     after, result = advance(others, parameters)
     gap = jnp.max(jnp.abs(jnp.delete(after, place, assume_unique_indices=True) - others))
-    good = converged & (gap <= 1e3 * tol * (1 + jnp.max(jnp.abs(after)))) & is_okay(result)
+    good = converged & (gap <= 1e3 * newton.tol * (1 + jnp.max(jnp.abs(after)))) & is_okay(result)
     result = RESULTS.where(good, result, RESULTS.reduced_map_not_found)
     value, y = unless_failed(result, (after[place], state(others, x)))
     return ReducedIterate(value, y, result)

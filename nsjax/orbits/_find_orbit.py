@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._numerics._autodiff import dense_jacobian, forward_only
+from .._numerics._root import Newton
 from .._numerics._text import known, suggesting, written
 from .._types import StateT, Y
-from ..flow._arguments import check_numbers, check_solve
+from ..flow._arguments import check_numbers, checked_start
+from ..flow._integrator import Integrator
 from ..flow._results import is_okay, raise_if, RESULTS, SolveError
 from ..flow._solve import HINTS
 from ..sweeps._sweep import sweep
@@ -106,14 +108,9 @@ def find_orbit(
     """
     if order is not None and (not isinstance(order, int) or order < 1):
         raise ValueError(f"Argument `order` must be a positive integer or None, but got {order!r}.")
-    y0, t0, _, solver, controller, given = check_solve(
-        system, t0, t0, y0, mode, solver, stepsize_controller, dfx.SaveAt(t1=True), max_steps, max_events, None
-    )
-    double = bool(jnp.finfo(t0.dtype).eps < 1e-10)
-    if stepsize_controller is None:
-        small = 1e-12 if double else 1e-6
-        controller = dfx.PIDController(rtol=small, atol=small)
-    tol = (1e-10 if double else 1e-4) if tol is None else tol
+    t0, y0, given = checked_start(system, t0, y0, mode)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, (1e-12, 1e-6))
+    tol = (1e-10 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4) if tol is None else tol
     if method not in (None, "shooting", "segments"):
         raise ValueError(f"Argument `method` must be 'shooting' or 'segments', but got {method!r}.")
     if symmetry is not None and (method == "segments" or segments is not None or pieces != 1):
@@ -132,7 +129,6 @@ def find_orbit(
     if throw:
         check_numbers(system, t0, t0, y0)
     system = arrays_of(system, t0.dtype)
-    how = dict(solver=solver, stepsize_controller=controller, max_steps=max_steps, max_events=max_events)
     autonomous = system.period is None
     if autonomous:
         check_autonomous(system, t0, y0)
@@ -150,8 +146,19 @@ def find_orbit(
     concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, t0, y0, period)))
     if order is None and not autonomous and not concrete:
         raise ValueError("Argument `order` must be given under `jit` and `vmap`: finding it out needs concrete values.")
-    newton = dict(tol=tol, max_iterations=max_iterations)
-    search = Search(t0, order, given or None, method, symmetry, backward, segments, pieces, concrete, how, newton)
+    search = Search(
+        t0=t0,
+        order=order,
+        mode=given or None,
+        method=method,
+        symmetry=symmetry,
+        backward=backward,
+        segments=segments,
+        pieces=pieces,
+        concrete=concrete,
+        integrator=integrator,
+        newton=Newton(tol, max_iterations),
+    )
     if isinstance(adjoint, dfx.DirectAdjoint) and not concrete:
         orbit = dense_jacobian(search.run, system, y0, period)
     else:

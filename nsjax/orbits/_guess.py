@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Scalar, Y
-from ..derivatives._saltation import states
 from ..derivatives._variational import arcs
+from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
-from ..flow._solve import solve
+from ..flow._solve import integrate
 from ..system._clock import clock
 from ..system._model import SwitchedSystem
 from ..system._relay import relay
@@ -28,7 +28,7 @@ Relays = dict[str, Int[Array, ""]] | None
 
 
 def base_point(
-    system: System, t0: Scalar, y0: Y, period: Scalar, sign: float, mode: Any, method: dict
+    system: System, t0: Scalar, y0: Y, period: Scalar, sign: float, mode: Any, integrator: Integrator
 ) -> tuple[Y, Scalar, Relays]:
     """A better guess, from the solution over two and a half guessed periods (backwards if `sign` is -1).
 
@@ -38,8 +38,8 @@ def base_point(
     of relays there, which within a hysteresis only the solution knows.
     """
     end_time = t0 + sign * 2.5 * period
-    method = method | dict(max_events=3 * method["max_events"])  # which is meant for one period
-    sol = solve(system, t0, end_time, y0, mode=mode, saveat=dfx.SaveAt(dense=True), throw=False, **method)
+    integrator = integrator._replace(max_events=3 * integrator.max_events)  # which is meant for one period
+    sol = integrate(system, t0, end_time, y0, integrator, mode=mode, saveat=dfx.SaveAt(dense=True))
     begin, end, _, modes = arcs(sol, t0, y0)
     begin, end = (jnp.minimum(sign * (t - t0), period) for t in (begin, end))
     slides = jnp.stack(
@@ -87,12 +87,12 @@ def at_start(model: SwitchedSystem, t: Scalar, y: Y, given: Relays = None) -> An
         elif isinstance(switch, clock):
             zero = model.counts(t)[k]
         modes.append(zero)
-    return states(model, t, y, tuple(modes))
+    return model.state_at(t, y, tuple(modes))
 
 
 @eqx.filter_jit
 def settle_down(
-    system: System, t0: Scalar, y0: Y, sign: float, mode: Any, method: dict
+    system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrator: Integrator
 ) -> tuple[Y, Scalar, Bool[Array, ""], Relays]:
     """Follows the solution (backwards if `sign` is -1) to where it settles; for an autonomous system also the time in
     which it returns there (0 if it does not), and whether it comes to rest; and the modes of relays there.
@@ -100,16 +100,16 @@ def settle_down(
     How long that takes is measured in steps of the integration, which know the system's own scale of time.
     """
     if system.period is not None:
-        last, at_last, _ = _laps(system, t0, y0, sign, mode, method, 100)
+        last, at_last, _ = _laps(system, t0, y0, sign, mode, integrator, 100)
         period = jnp.asarray(system.period, t0.dtype)
         return last, period, jnp.zeros((), bool), of_relays(system, at_last)
     # Only a guess is wanted: a loose tolerance makes long steps, and so the solution is followed farther.
     loose = 1e-6 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4
     controller = dfx.PIDController(rtol=loose, atol=loose)
-    big = dict(solver=method["solver"], stepsize_controller=controller, max_steps=2000, max_events=1000)
-    last = solve(system, t0, t0 + sign * 1e9, y0, mode=mode, throw=False, **big)
+    big = Integrator(integrator.solver, controller, max_steps=2000, max_events=1000)
+    last = integrate(system, t0, t0 + sign * 1e9, y0, big, mode=mode)
     given = tuple(last.mode1) if system.switches else None
-    loop = solve(system, t0, t0 + sign * 1e9, last.y1, mode=given, saveat=dfx.SaveAt(dense=True), throw=False, **big)
+    loop = integrate(system, t0, t0 + sign * 1e9, last.y1, big, mode=given, saveat=dfx.SaveAt(dense=True))
     starts, stops, points, _, steps = loop.dense
     # Eight points a step: the polynomial between control points bends little.
     u = jnp.asarray(np.arange(8) / 8, starts.dtype)
@@ -134,7 +134,7 @@ def settle_down(
 def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
     """Whether an equilibrium of the sliding field is one of a continuum: on the surfaces that hold it the derivative of
     the field is singular."""
-    model = SwitchedSystem(system, jnp.ones_like(t0), t0, y)
+    model = SwitchedSystem.forwards(system, t0, y)
     state = at_start(model, t0, y)
     x, unravel = jfu.ravel_pytree(y)
     matrix = jax.jacfwd(lambda x: ravel(model.flow(t0, unravel(x), state)))(x)
@@ -164,35 +164,39 @@ def held_throughout(system: System, begin: Array, end: Array, modes: Array) -> B
 
 
 @eqx.filter_jit
-def repeats_held(system: System, t0: Scalar, y: Y, period: Scalar, mode: Any, method: dict) -> Bool[Array, ""]:
+def repeats_held(
+    system: System, t0: Scalar, y: Y, period: Scalar, mode: Any, integrator: Integrator
+) -> Bool[Array, ""]:
     """Whether a state of a forced system comes back, held by friction all the time."""
-    sol = solve(system, t0, t0 + period, y, mode=mode, throw=False, **method)
+    sol = integrate(system, t0, t0 + period, y, integrator, mode=mode)
     begin, end, _, modes = arcs(sol, t0, y)
     back = distance(ravel(sol.y1), ravel(y)) <= 1e-8 * (1 + jnp.max(jnp.abs(ravel(y))))
     return is_okay(sol.result) & back & held_throughout(system, begin, end, modes)
 
 
 def _laps(
-    system: System, t0: Scalar, y0: Y, sign: float, mode: Any, method: dict, number: int
+    system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrator: Integrator, number: int
 ) -> tuple[Y, tuple, Float[Array, "laps n"]]:
-    """A solution of a forced system after so many periods, its mode, and its states after each: `method` is meant for
-    one."""
+    """A solution of a forced system after so many periods, its mode, and its states after each. The bounds of
+    `integrator` are those of one period."""
     end = t0 + sign * jnp.asarray(system.period, t0.dtype)
 
     def lap(here: tuple, _: Any) -> tuple[tuple, Array]:
         y, mode = here
-        sol = solve(system, t0, end, y, mode=mode if system.switches else None, throw=False, **method)
+        sol = integrate(system, t0, end, y, integrator, mode=mode if system.switches else None)
         return (sol.y1, tuple(sol.mode1)), ravel(sol.y1)
 
-    first = solve(system, t0, end, y0, mode=mode, throw=False, **method)
+    first = integrate(system, t0, end, y0, integrator, mode=mode)
     (last, at_last), later = lax.scan(lap, (first.y1, tuple(first.mode1)), None, length=number - 1)
     return last, at_last, jnp.concatenate([ravel(first.y1)[None], later])
 
 
 @eqx.filter_jit
-def repeats(system: System, t0: Scalar, y0: Y, sign: float, mode: Any, method: dict, most: int = 16) -> Int[Array, ""]:
+def repeats(
+    system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrator: Integrator, most: int = 16
+) -> Int[Array, ""]:
     """After how many periods of the forcing a solution that has settled repeats itself."""
-    _, _, points = _laps(system, t0, y0, sign, mode, method, most)
+    _, _, points = _laps(system, t0, y0, sign, mode, integrator, most)
     gaps = distance(points, ravel(y0))
     # What is left of the way to where it settles is small beside the state, and beside how far the points lie apart.
     extent = 1e-4 * jnp.max(jnp.abs(points)) + 1e-2 * jnp.max(gaps)

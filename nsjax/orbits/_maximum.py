@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from .._numerics._autodiff import frozen
 from .._numerics._minima import NODES
 from .._types import Scalar, Y
+from ..flow._integrator import Integrator
 from ..system._system import System
 from .segments._arcs import Arcs, flows_of
 
@@ -18,9 +19,9 @@ from .segments._arcs import Arcs, flows_of
 REFINEMENTS = 2  # steps of Newton's method from where the polynomials are largest: each doubles its digits
 
 
-def largest(system: System, arcs: Arcs, how: tuple[tuple[str, Any], ...], fn: Callable[[Scalar, Y], Scalar]) -> Scalar:
+def largest(system: System, arcs: Arcs, integrator: Integrator, fn: Callable[[Scalar, Y], Scalar]) -> Scalar:
     """The maximum of `fn(t, y)`; its derivatives of first and second order are right where the maximum is one alone."""
-    flows, x = flows_of(system, arcs, how)
+    flows, x = flows_of(system, arcs, integrator)
     still, points = frozen((flows, x))
     unravel = jfu.ravel_pytree(flows.y0)[1]
 

@@ -13,13 +13,15 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from .._numerics._text import between, listed, shown
 from .._types import Number, Scalar, StateT, Y
 from ..derivatives._floquet import trivial
-from ..derivatives._saltation import saltation_matrices, states
+from ..derivatives._saltation import saltation_matrices
+from ..flow._integrator import Integrator
 from ..flow._results import is_okay, outcomes, RESULTS
 from ..flow._solution import Events, Itinerary, Solution
 from ..flow._solve import solve
+from ..system._model import SwitchedSystem
 from ..system._system import System
 from ._maximum import largest
-from .segments._arcs import Arcs, model_of, Path, path_of, SAMPLES
+from .segments._arcs import Arcs, Path, path_of, SAMPLES
 
 
 @shown
@@ -61,8 +63,7 @@ class Orbit(eqx.Module, Generic[StateT]):
     violation_t: Scalar
     arcs: Arcs
     result: RESULTS
-    # solver, stepsize_controller, max_steps, max_events: static, so that orbits come out of `vmap`
-    options: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    integrator: Integrator = eqx.field(static=True)  # so that orbits come out of `vmap`
 
     @property
     def itinerary(self) -> Itinerary:
@@ -100,8 +101,8 @@ class Orbit(eqx.Module, Generic[StateT]):
             if normal is not None:
                 raise ValueError("Argument `normal` must be None for a forced system: its section is a phase of it.")
             return self.monodromy
-        model = model_of(self.system, self.t0, self.y0)
-        f = ravel(model.flow(self.t0, self.y0, states(model, self.t0, self.y0, tuple(self.mode))))
+        model = SwitchedSystem.forwards(self.system, self.t0, self.y0)
+        f = ravel(model.flow(self.t0, self.y0, model.state_at(self.t0, self.y0, tuple(self.mode))))
         n = f if normal is None else ravel(normal).astype(f.dtype)
         return self.monodromy - jnp.outer(f, n @ self.monodromy) / (n @ f)
 
@@ -115,7 +116,7 @@ class Orbit(eqx.Module, Generic[StateT]):
 
         **Returns:** a `Path` with `t`, `y` and `mode`, one row for each arc; those past the last have no length.
         """
-        return path_of(self.system, self.arcs, samples, self.options)
+        return path_of(self.system, self.arcs, samples, self.integrator)
 
     def maximum(self, of: Callable[[Scalar, StateT], Number]) -> Scalar:
         """The largest value along the orbit of a quantity of the state, with derivatives by the parameters.
@@ -130,7 +131,7 @@ class Orbit(eqx.Module, Generic[StateT]):
 
         **Returns:** the value, in the unit of `of`. Derivatives jump where the maximum does from one place to another.
         """
-        return largest(self.system, self.arcs, self.options, of)
+        return largest(self.system, self.arcs, self.integrator, of)
 
     def solve(
         self, *, saveat: dfx.SaveAt = dfx.SaveAt(dense=True), periods: float = 1, **kwargs: Any
@@ -141,7 +142,9 @@ class Orbit(eqx.Module, Generic[StateT]):
         """
         end = self.t0 + periods * self.period
         mode = tuple(self.mode) if self.events.names else None
-        return solve(self.system, self.t0, end, self.y0, mode=mode, saveat=saveat, **(dict(self.options) | kwargs))
+        return solve(
+            self.system, self.t0, end, self.y0, mode=mode, saveat=saveat, **(self.integrator._asdict() | kwargs)
+        )
 
     def __str__(self) -> str:
         if jnp.ndim(self.period):

@@ -9,12 +9,14 @@ import jax.lax as lax
 import jax.numpy as jnp
 
 from .._numerics._autodiff import frozen
+from .._numerics._root import Newton
 from .._types import Scalar, Y
+from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
 from ..system._system import System
 from ._guess import held_throughout, of_relays, repeats, repeats_held, settle_down, sticks_anywhere, undecided
 from ._orbit import Orbit
-from ._shooting import shoot
+from ._shooting import Shooting
 from .segments._guess import cuts_from, cuts_near, Segment
 from .segments._solve import by_segments
 
@@ -35,8 +37,8 @@ class Search(NamedTuple):
     segments: Sequence[Segment] | None
     pieces: int
     concrete: bool  # whether all numbers are known, so that one try may follow another
-    how: dict  # solver and its bounds
-    newton: dict  # the bounds of Newton's method
+    integrator: Integrator
+    newton: Newton
 
     @property
     def sign(self) -> float:
@@ -52,13 +54,13 @@ class Search(NamedTuple):
 
     def _found(self, system: System, y0: Y, period: Any) -> Orbit:
         if self.segments is not None:
-            cuts = cuts_from(frozen(system), self.segments, self.t0, lax.stop_gradient(y0), self.how)
-            return by_segments(system, cuts, self.t0, self.order or 1, self.pieces, how=self.how, **self.newton)
+            cuts = cuts_from(frozen(system), self.segments, self.t0, lax.stop_gradient(y0), self.integrator)
+            return by_segments(system, cuts, self.t0, self.order or 1, self.pieces, self.integrator, self.newton)
         if system.period is None and period is None:
             return self._from_nothing(system, y0)
         if self.order is None and system.period is not None:
             start, _, _, mode = self._settled(system, y0)
-            order = int(repeats(system, self.t0, start, self.sign, mode, self.how))
+            order = int(repeats(system, self.t0, start, self.sign, mode, self.integrator))
             return self._tries(system, start, jnp.ones_like(self.t0), order, mode)
         period = jnp.asarray(1.0 if period is None else period, self.t0.dtype)
         if self.concrete and not period > 0:
@@ -76,7 +78,7 @@ class Search(NamedTuple):
             if period > 0:
                 # A state that repeats itself, and is not found as a root: it is not isolated.
                 forced = system.period is not None and not self.backward
-                if forced and repeats_held(frozen(system), self.t0, start, period * order, mode, self.how):
+                if forced and repeats_held(frozen(system), self.t0, start, period * order, mode, self.integrator):
                     return eqx.tree_at(lambda o: o.result, orbit, RESULTS.orbit_sticks_for_ever)
                 second = self._tries(system, start, period, order, mode)
                 orbit = second if bool(is_okay(second.result)) else orbit
@@ -96,7 +98,7 @@ class Search(NamedTuple):
         return RESULTS.where(sticks, RESULTS.orbit_sticks_for_ever, RESULTS.orbit_is_equilibrium)
 
     def _settled(self, system: System, y0: Y) -> tuple[Y, Scalar, Any, Any]:
-        return settle_down(frozen(system), self.t0, lax.stop_gradient(y0), self.sign, self.mode, self.how)
+        return settle_down(frozen(system), self.t0, lax.stop_gradient(y0), self.sign, self.mode, self.integrator)
 
     def _from_nothing(self, system: System, y0: Y) -> Orbit:
         """Of an autonomous system, without a guess of the period."""
@@ -120,13 +122,14 @@ class Search(NamedTuple):
 
     def _once(self, system: System, y0: Y, period: Scalar, order: int, mode: Any, pieces: int | None) -> Orbit:
         """By shooting, or by segments in so many pieces."""
-        t0, how = self.t0, self.how
+        t0, integrator = self.t0, self.integrator
         if pieces is None:
-            return shoot(system, t0, y0, period, order, self.symmetry, self.backward, mode, how=how, **self.newton)
-        cuts, closes = cuts_near(frozen(system), t0, lax.stop_gradient(y0), period, order, mode, how)
+            shooting = Shooting(order, self.symmetry, self.backward, integrator, self.newton)
+            return shooting.orbit(system, t0, y0, period, mode)
+        cuts, closes = cuts_near(frozen(system), t0, lax.stop_gradient(y0), period, order, mode, integrator)
         if self.concrete:  # without the rows that are only there to fill up
             cuts = cuts.first(int(cuts.num) + 1)
-        orbit = by_segments(system, cuts, t0, order, pieces, how=how, **self.newton)
+        orbit = by_segments(system, cuts, t0, order, pieces, integrator, self.newton)
         result = RESULTS.where(closes, orbit.result, RESULTS.orbit_not_found)
         return eqx.tree_at(lambda o: o.result, orbit, result)
 

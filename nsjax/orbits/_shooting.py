@@ -1,7 +1,7 @@
 """Periodic orbits by shooting: through the event-driven flow, which finds the itinerary."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -12,13 +12,14 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._numerics._autodiff import frozen
-from .._numerics._root import find_root
+from .._numerics._root import find_root, Newton
 from .._types import Scalar, Y
 from ..derivatives._floquet import floquet, forwards, structural_zeros
 from ..derivatives._variational import arcs, monodromy_by_arcs
+from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
 from ..flow._solution import Events
-from ..flow._solve import solve
+from ..flow._solve import integrate
 from ..system._model import SwitchedSystem
 from ..system._relay import relay
 from ..system._system import System
@@ -27,99 +28,95 @@ from ._orbit import distance, fractions, judge, Orbit, ravel
 from .segments._arcs import Arcs
 
 
-@eqx.filter_jit
-def shoot(
-    system: System,
-    t0: Scalar,
-    y0: Y,
-    period: Scalar,
-    order: int,
-    symmetry: Callable[[Y], Y] | None,
-    backward: bool,
-    mode: Any,
-    how: dict,
-    tol: float,
-    max_iterations: int,
-) -> Orbit:
-    """Newton's method on y(t0 + period) = y0, or y(t0 + period/2) = `symmetry`(y0), and what is said of the orbit.
+class Shooting(NamedTuple):
+    """Shooting at y(t0 + period) = y0, or y(t0 + period/2) = `symmetry`(y0); or, `backward`, at y(t0 - period) = y0."""
 
-    With `backward` on y(t0 - period) = y0; what is said is of the orbit as it runs forwards.
-    """
-    sign = -1.0 if backward else 1.0
-    autonomous = system.period is None
-    still = frozen(system)
-    guess = lax.stop_gradient(y0)
-    model = SwitchedSystem(still, jnp.ones_like(frozen(t0)), frozen(t0), guess)
-    if autonomous:
-        guess, period, mode = lax.stop_gradient(
-            base_point(still, frozen(t0), guess, lax.stop_gradient(period), sign, mode, how)
-        )
-    flat, unravel = jfu.ravel_pytree(guess)
-    first_period = lax.stop_gradient(period)
+    order: int
+    symmetry: Callable[[Y], Y] | None
+    backward: bool
+    integrator: Integrator
+    newton: Newton
 
-    def period_of(z: tuple, system: System) -> Scalar:
-        return jnp.exp(z[1]) if autonomous else jnp.asarray(system.period, t0.dtype) * order
+    @property
+    def sign(self) -> float:
+        return -1.0 if self.backward else 1.0
 
-    def flow(system: System, t0: Scalar, x: Array, period: Scalar) -> Array:
-        sol = solve(system, t0, t0 + sign * period, unravel(x), mode=mode, throw=False, **how)
-        # A solution that ended early is no solution: Newton's method must not be led by it.
-        ok = is_okay(sol.result)
-        return jnp.where(ok, ravel(sol.y1), jnp.nan)
+    def orbit(self, system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any) -> Orbit:
+        """What Newton's method finds, and what is said of the orbit as it runs forwards."""
+        return _shoot(self, system, t0, y0, period, mode)
 
-    part = 1.0 if symmetry is None else 0.5
+    def equations(self, start: Y, period: Scalar, mode: Any, normal: Array | None) -> tuple[Any, Callable]:
+        """The unknowns, with their guess, and what vanishes: a function of them and of (system, t0). Of an autonomous
+        system the logarithm of the period is unknown too, and the base point stays on the section through the guess
+        that has this `normal`: Poincaré's phase condition."""
+        flat, unravel = jfu.ravel_pytree(start)
+        part = 1.0 if self.symmetry is None else 0.5
 
-    def image(x: Array) -> Array:
-        return x if symmetry is None else ravel(symmetry(unravel(x)))
+        def returns(z: tuple, parameters: tuple) -> Array:
+            system, t0 = parameters
+            end = t0 + self.sign * part * self.period(z, system)
+            sol = integrate(system, t0, end, unravel(z[0]), self.integrator, mode=mode)
+            # A solution that ended early is no solution: Newton's method must not be led by it.
+            last = jnp.where(is_okay(sol.result), ravel(sol.y1), jnp.nan)
+            return last - (z[0] if self.symmetry is None else ravel(self.symmetry(unravel(z[0]))))
 
-    def returns(z: tuple, parameters: tuple) -> Array:
-        system, t0 = parameters
-        return flow(system, t0, z[0], part * period_of(z, system)) - image(z[0])
-
-    unknown: Any = (flat,)
-    residual: Callable[[tuple, tuple], Any] = returns
-    at_rest = jnp.zeros((), bool)
-    if autonomous:
-        # Poincaré's phase condition: the base point stays on the section through the guess.
-        normal = ravel(model.flow(frozen(t0), guess, at_start(model, frozen(t0), guess, mode)))
+        if normal is None:
+            return (flat,), returns
         speed = normal @ normal
 
         def on_section(z: tuple, parameters: tuple) -> tuple:
             return returns(z, parameters), normal @ (z[0] - flat) / jnp.where(speed == 0, 1, speed)
 
-        unknown, residual = (flat, jnp.log(first_period)), on_section
-        at_rest = jnp.sqrt(speed) * period <= 1e-9 * (1 + jnp.max(jnp.abs(flat)))
-    # What depends on parameters does so by the second argument alone: the search needs no derivatives.
-    z, converged = find_root(residual, unknown, (system, t0), tol, max_iterations)
-    x, period = z[0], period_of(z, system)
+        return (flat, jnp.log(period)), on_section
 
-    _, shares = fractions(autonomous, order)
-    end = t0 + sign * period
-    sol = solve(
-        system, t0, end, unravel(x), mode=mode, throw=False, **how,
-        saveat=dfx.SaveAt(ts=t0 + sign * period * jnp.asarray(shares, t0.dtype), t1=True),
-    )  # fmt: skip
+    def period(self, z: tuple, system: System) -> Scalar:
+        return jnp.exp(z[1]) if system.period is None else jnp.asarray(system.period, z[0].dtype) * self.order
+
+
+@eqx.filter_jit
+def _shoot(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any) -> Orbit:
+    sign, integrator, tol = shooting.sign, shooting.integrator, shooting.newton.tol
+    autonomous = system.period is None
+    still, t_still = frozen((system, t0))
+    guess, first_period = lax.stop_gradient((y0, period))
+    model = SwitchedSystem.forwards(still, t_still, guess)
+    normal = None
+    if autonomous:
+        guess, first_period, mode = lax.stop_gradient(
+            base_point(still, t_still, guess, first_period, sign, mode, integrator)
+        )
+        normal = ravel(model.flow(t_still, guess, at_start(model, t_still, guess, mode)))
+    unravel = jfu.ravel_pytree(guess)[1]
+    unknown, residual = shooting.equations(guess, first_period, mode, normal)
+    # What depends on parameters does so by the second argument alone: the search needs no derivatives.
+    z, converged = find_root(residual, unknown, (system, t0), shooting.newton)
+    x, period = z[0], shooting.period(z, system)
+
+    shares = jnp.asarray(fractions(autonomous, shooting.order)[1], t0.dtype)
+    saveat = dfx.SaveAt(ts=t0 + sign * period * shares, t1=True)
+    sol = integrate(system, t0, t0 + sign * period, unravel(x), integrator, mode=mode, saveat=saveat)
     points = jax.vmap(ravel)(sol.ys)
     error = distance(points[-1], x)
     size = 1 + jnp.max(jnp.abs(x))
     # A relay has a memory: its mode must come back with the state.
-    relays = [k for k, switch in enumerate(system.switches) if isinstance(switch, relay)]
-    closes = jnp.all(jnp.asarray([sol.mode0[k] == sol.mode1[k] for k in relays], bool))
+    closes = jnp.all(jnp.asarray([sol.mode0[k] == sol.mode1[k] for k in model.of_kind(relay)], bool))
     good = converged & (error <= 1e3 * tol * size) & is_okay(sol.result) & closes
-    result = judge(good, x, points[:-1], autonomous, order)
-    if autonomous:
+    result = judge(good, x, points[:-1], autonomous, shooting.order)
+    if normal is not None:
         # Where Newton's method ends near an equilibrium, its Jacobian is singular and it seldom says that it converged.
         last = ravel(model.flow(t0, unravel(x), at_start(model, t0, unravel(x), mode)))
+        at_rest = jnp.sqrt(normal @ normal) * first_period <= 1e-9 * (1 + jnp.max(jnp.abs(unknown[0])))
         at_rest = at_rest | (jnp.max(jnp.abs(last)) * first_period <= 1e-6 * size)
         result = RESULTS.where(at_rest, RESULTS.orbit_is_equilibrium, result)
-
     grazes = (sol.result == RESULTS.tangential_event) & (result == RESULTS.successful)
     result = RESULTS.where(grazes, RESULTS.tangential_event, result)
+
     begin, stop, y, modes = arcs(sol, t0, unravel(x))
     along, events = Arcs(begin, stop, modes, jax.tree.map(lambda y: y[:, None], y)), sol.events
     zeros = structural_zeros(system, modes)
-    monodromy = monodromy_by_arcs(system, sol, t0, unravel(x), how["solver"], how["stepsize_controller"])
+    monodromy = monodromy_by_arcs(system, sol, t0, unravel(x), integrator)
     found_out = floquet(monodromy[None], zeros, autonomous)
-    if backward:
+    if shooting.backward:
         found_out = forwards(found_out, zeros, autonomous)
         along, events = _reversed(along, events, unravel(x), period)
         zeros = jnp.zeros_like(zeros)
@@ -141,7 +138,7 @@ def shoot(
         violation_t=t0,
         arcs=along,
         result=result,
-        options=tuple(how.items()),
+        integrator=integrator,
     )
 
 

@@ -9,7 +9,6 @@ import itertools
 from collections.abc import Callable, Generator
 from typing import Any
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.extend.core as jex
@@ -21,7 +20,7 @@ from jaxtyping import Array, Float
 from .._numerics._jaxpr import is_affine, is_constant
 from .._numerics._series import _CALLS
 from .._types import Scalar, Y
-from ..flow._arguments import check_solve
+from ..flow._arguments import checked_start
 from ..system._sgn import sgn
 from ..system._switch import AbstractSwitch, forwarded
 from ..system._system import arrays_of, SwitchValues, System
@@ -210,7 +209,7 @@ def mark_kinks(system: System, y0: Y) -> System:
     **Raises:** `ValueError` where there is no kink; for one inside a loop or branch (`lax.scan`, `lax.cond`), or whose
     h depends on the value of a switch; and where the field is not affine in more than four of them.
     """
-    y, t, *_ = check_solve(system, 0.0, 0.0, y0, None, dfx.Dopri8(), None, dfx.SaveAt(t1=True), 1, 1, None)
+    t, y, _ = checked_start(system, 0.0, y0, None)
     field, own, zero = f"`{type(system).__name__}.vector_field`", [k.name for k in system.switches], jnp.zeros_like(t)
     kinks: list[tuple[tuple[int, ...], tuple[str, ...]]] = []
     for kind, h in _program(system, t, y, (zero,) * len(own)):

@@ -3,7 +3,6 @@
 import itertools
 from typing import Any, NamedTuple
 
-import diffrax as dfx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._numerics._text import between, shown
 from .._types import Y
-from ..flow._arguments import check_solve
+from ..flow._arguments import checked_start
 from ..system._model import SwitchedSystem
 from ..system._parameter import get_parameter, parameter_path, put_parameter
 from ..system._sgn import sgn
@@ -80,10 +79,10 @@ def generalized_jacobian(
     **Raises:** `ValueError` where the field jumps at the point: there it has no generalized Jacobian (see
     `saltation_matrix` for what a solution's derivative does); or for an unknown parameter.
     """
-    y, t, _, _, _, given = check_solve(system, t, t, y, mode, dfx.Dopri8(), None, dfx.SaveAt(t1=True), 1, 1, None)
+    t, y, given = checked_start(system, t, y, mode)
     system = arrays_of(system, t.dtype)
     small = (1e-9 if jnp.finfo(t.dtype).eps < 1e-10 else 1e-4) if tolerance is None else tolerance
-    model = SwitchedSystem(system, jnp.ones_like(t), t, y)
+    model = SwitchedSystem.forwards(system, t, y)
     flat, unravel = jfu.ravel_pytree(y)
     values, on = [], []
     for k, switch in enumerate(model.switches):
@@ -102,7 +101,7 @@ def generalized_jacobian(
         return tuple(s)
 
     def field(system: System, x: Array, s: tuple) -> Array:
-        return jfu.ravel_pytree(SwitchedSystem(system, jnp.ones_like(t), t, y).field(t, unravel(x), s))[0]
+        return jfu.ravel_pytree(SwitchedSystem.forwards(system, t, y).field(t, unravel(x), s))[0]
 
     sides = [sided(side) for side in itertools.product((-1, 1), repeat=len(on))]
     fields = jnp.stack([field(system, flat, s) for s in sides])

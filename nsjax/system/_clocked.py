@@ -29,9 +29,9 @@ class Clocked(eqx.Module):
         self.direction = direction
         self.window = None
         self.switches = system.switches
-        self.clocks = self.of(clock)
+        self.clocks = self.of_kind(clock)
 
-    def of(self, kind: type[AbstractSwitch]) -> tuple[int, ...]:
+    def of_kind(self, kind: type[AbstractSwitch]) -> tuple[int, ...]:
         """Which switches are of a kind."""
         return tuple(k for k, switch in enumerate(self.switches) if isinstance(switch, kind))
 

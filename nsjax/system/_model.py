@@ -24,6 +24,7 @@ from .._numerics._linalg import linear_solve, parallel
 from .._types import Scalar, Y
 from ._clocked import Clocked
 from ._mode import BEYOND, ModeState, pick, Slot
+from ._parameter import Path, put_parameter
 from ._system import System
 
 
@@ -93,6 +94,26 @@ class SwitchedSystem(Clocked):
             if k in self.holdable:
                 slots += [Slot(k, sign, True) for sign in ((1,) if k in self.contacts else (1, -1))]
         self.slots = tuple(slots)
+
+    @classmethod
+    def forwards(cls, system: System, t: Scalar, y: Y) -> "SwitchedSystem":
+        """Of a system in the time of its user; `t` and `y` tell shapes and structure only."""
+        return cls(system, jnp.ones_like(t), t, y)
+
+    def with_system(self, system: System) -> "SwitchedSystem":
+        """The same structure with other parameters."""
+        return eqx.tree_at(lambda m: m.system, self, system)
+
+    def with_parameter(self, path: Path, value: Any) -> "SwitchedSystem":
+        return self.with_system(put_parameter(self.system, path, value))
+
+    def state_at(self, t: Scalar, y: Y, mode: tuple) -> ModeState:
+        """A mode, with the component of each h that is active at a state: the least."""
+        parts = [
+            None if n == 1 else jnp.argmin(jnp.stack(self.h(k, t, y))).astype(jnp.int32)
+            for k, n in enumerate(self.parts)
+        ]
+        return ModeState.of(mode, parts)
 
     # The smooth field for given switch values, and the indicator functions.
 

@@ -39,7 +39,7 @@ def orbit(result=GOOD, multipliers=(1, 0.5)):
         system=BELT, t0=jnp.asarray(0.0), y0=STATE, mode=jnp.array([-1]), period=jnp.asarray(13.5), events=events,
         monodromy=jnp.eye(2), multipliers=jnp.array(multipliers, complex), structural_zeros=jnp.asarray(0),
         stable=jnp.asarray(True), residual=jnp.asarray(1e-15), admissible=jnp.asarray(True),
-        violation=jnp.asarray(0.0), violation_t=jnp.asarray(0.0), arcs=ARCS, result=result, options=(),
+        violation=jnp.asarray(0.0), violation_t=jnp.asarray(0.0), arcs=ARCS, result=result, integrator=None,
     )  # fmt: skip
 
 

@@ -9,15 +9,15 @@ from models import Motion, pid
 
 import nsjax
 from nsjax import continue_orbit, find_orbit, gallery
-from nsjax.continuation.orbits._start import options
-from nsjax.orbits.segments._arcs import model_of
+from nsjax.flow._integrator import Integrator
 from nsjax.orbits.segments._equations import OrbitCurve
 from nsjax.orbits.segments._segment_flow import ALWAYS, exactness, FREE_MODES, NEVER, SegmentFlow
+from nsjax.system._model import SwitchedSystem
 from nsjax.system._system import arrays_of
 
 
 Y = Motion(jnp.asarray(0.3), jnp.asarray(-0.4))
-HOW = options(dfx.Dopri8(), None, 4096)
+HOW = Integrator(dfx.Dopri8(), None, 4096).checked(float, (1e-12, 1e-6))
 
 
 class Driven(nsjax.System):
@@ -37,14 +37,14 @@ class Driven(nsjax.System):
 
 def flow_of(system, exact, name="omega", slides=True):
     system = arrays_of(system, jnp.float64)
-    model = model_of(system, jnp.zeros(()), Y)
+    model = SwitchedSystem.forwards(system, jnp.zeros(()), Y)
     return SegmentFlow(model, (name,), Y, HOW, exact, slides)
 
 
 def test_which_modes():
     def kind(system):
         system = arrays_of(system, jnp.float64)
-        return exactness(model_of(system, jnp.zeros(()), Y), jnp.zeros(()), Y)
+        return exactness(SwitchedSystem.forwards(system, jnp.zeros(()), Y), jnp.zeros(()), Y)
 
     assert kind(gallery.ForcedFriction(omega=0.8)) == ALWAYS
     assert kind(gallery.Trilinear(omega=1.2)) == FREE_MODES

@@ -15,7 +15,6 @@ from ...derivatives._floquet import trivial
 from ...orbits.segments._equations import linearised, OrbitCurve
 from ...orbits.segments._itinerary import capacity_for, Course, EVENT, GRAZING, Start
 from ...orbits.segments._point import advance, along_segment, PointData, zeros_at_begin
-from ...orbits.segments._segment_flow import with_parameter
 from ...system._parameter import get_parameter
 from ..orbits._bifurcation import Origin
 from ..orbits._test_functions import branch_value, CIRCLE, CORNERS, Test
@@ -237,7 +236,7 @@ def _guards_along(
 ) -> tuple[Array, Array, Array]:
     """The least values of the guards along a segment, divided by zeros of these orders at its ends; where; and the
     states there."""
-    model, n = with_parameter(curve.model, curve.path, look.parameter), len(curve.sizes)
+    model, n = curve.model.with_parameter(curve.path, look.parameter), len(curve.sizes)
     orders = jnp.concatenate([jnp.zeros((2, 2 * n), orders.dtype), orders], axis=1)
     a, b, x = (jnp.asarray(column)[row] for column in (look.begin, look.end, look.x))
     mode, part = jnp.asarray(course.mode)[row], jnp.asarray(course.part)[row]

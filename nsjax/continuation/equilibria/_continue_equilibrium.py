@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..._types import Y
-from ...equilibria._equilibrium import Equilibrium, nearest_state
+from ...equilibria._equilibrium import Equilibrium
 from ...equilibria._find_equilibrium import checked_equilibrium, find_equilibrium
 from ...system._model import SwitchedSystem
 from ...system._parameter import get_parameter, parameter_path
@@ -96,7 +96,7 @@ def continue_equilibrium(
             f"Argument `interval` must be (low, high) and hold {value:.6g}, the value of `{parameter}` in `system`, "
             f"but is ({low:.6g}, {high:.6g})."
         )
-    model = SwitchedSystem(checked, jnp.ones_like(t), t, y)
+    model = SwitchedSystem.forwards(checked, t, y)
     size = len(jfu.ravel_pytree(y)[0]) + len(model.holdable) + 1
     mark = jnp.asarray((value - low) / (high - low), t.dtype)
     curve = EquilibriumCurve(model, path, t, y, jnp.asarray(low, t.dtype), mark, jnp.ones(size, t.dtype))
@@ -112,7 +112,7 @@ def _place(curve: EquilibriumCurve, found: Equilibrium, value: float) -> tuple[A
     if not found.admissible:
         raise ValueError("Argument `start` must lead to an equilibrium, but what was found is virtual:\n" + str(found))
     model, y = curve.model, jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), found.y, curve.like)
-    state = nearest_state(model, curve.t, y, tuple(found.mode))
+    state = model.state_at(curve.t, y, tuple(found.mode))
     part = [0 if p is None else int(p) for p in state.part]
     mode = np.array([[int(m) for m in found.mode], part], np.int32).reshape(2, -1)
     sigma = jnp.asarray([found.multipliers[k] for k in model.holdable], curve.t.dtype)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._numerics._root import find_root
+from ..._numerics._root import find_root, Newton
 from ...setvalued._pencil import bialternate
 
 
@@ -112,7 +112,7 @@ def _corrected(curve: Curve, origin: Array, tangent: Array, s: Array, guess: Arr
     def residual(u: Array, _: Any) -> Array:
         return jnp.append(curve.residual(u, mode) / rows, tangent @ (u - origin) - s)
 
-    return find_root(residual, guess, None, TOLERANCE, 12)
+    return find_root(residual, guess, None, Newton(TOLERANCE, 12))
 
 
 @eqx.filter_jit
@@ -178,7 +178,7 @@ def on_surface(curve: Curve, u: Array, mode: Array, which: Array) -> Array:
     def residual(u: Array, _: Any) -> Array:
         return jnp.append(curve.residual(u, mode), distances(curve, u)[which])
 
-    found, good = find_root(residual, u, None, TOLERANCE, 12)
+    found, good = find_root(residual, u, None, Newton(TOLERANCE, 12))
     return jnp.where(good, found, u)
 
 
@@ -193,7 +193,7 @@ def branch_point(curve: Curve, u: Array, mode: Array) -> tuple[Array, Bool[Array
         pull = jax.vjp(lambda u: curve.residual(u, mode), u)[1](psi)[0]
         return curve.residual(u, mode) + beta * psi, pull, psi @ psi - 1
 
-    (u, _, beta), good = find_root(residual, (u, left, jnp.zeros((), u.dtype)), None, TOLERANCE, 20)
+    (u, _, beta), good = find_root(residual, (u, left, jnp.zeros((), u.dtype)), None, Newton(TOLERANCE, 20))
     return u, good & (jnp.abs(beta) < 1e-9)
 
 

@@ -65,7 +65,7 @@ class EquilibriumCurve(Curve):
     def at(self, u: Array) -> tuple[SwitchedSystem, Y, Array]:
         x, sigma, value = self.parts(u)
         system = put_parameter(self.model.system, self.path, value)
-        return eqx.tree_at(lambda m: m.system, self.model, system), jfu.ravel_pytree(self.like)[1](x), sigma
+        return self.model.with_system(system), jfu.ravel_pytree(self.like)[1](x), sigma
 
     def state(self, mode: Int[Array, "2 switches"]) -> ModeState:
         return ModeState.of(mode[0], [p if n > 1 else None for p, n in zip(mode[1], self.model.parts)])

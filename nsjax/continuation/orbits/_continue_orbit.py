@@ -11,12 +11,13 @@ import jax.numpy as jnp
 
 from ..._numerics._text import shown
 from ..._types import StateT, Y
+from ...flow._integrator import Integrator
 from ...maps._corner_normal_form import Cycle
 from ...orbits._orbit import Orbit
-from ...orbits.segments._arcs import model_of
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import Course
 from ...orbits.segments._point import PointData
+from ...system._model import SwitchedSystem
 from ...system._parameter import get_parameter, parameter_path
 from ...system._system import System
 from .._archive import Archive, plain, save, table
@@ -26,12 +27,12 @@ from ._branch import orbit_branch, OrbitBranch, OrbitStrand, Point, TYPES as OF_
 from ._branch_switching import Half, itinerary, Node
 from ._explorer import Exit, Frontier, OrbitExplorer, OrbitTree
 from ._record import Measures, Recorder
-from ._start import curve_and_start, options
+from ._start import curve_and_start
 from ._test_functions import Test
 from ._tracer import Arc, OrbitPoint, OrbitTracer, Zero
 
 
-GIVEN = ("model", "path", "like", "how")  # what of a curve follows from the model, and is not saved
+GIVEN = ("model", "path", "like", "integrator")  # what of a curve follows from the model, and is not saved
 TYPES = {
     **OF_BRANCHES,
     **table(
@@ -177,8 +178,8 @@ class OrbitContinuation(Generic[StateT]):
         stepsize_controller: dfx.AbstractStepSizeController | None = None,
         max_steps: int = 4096,
     ):
-        how = options(solver, stepsize_controller, max_steps)
-        curve, start = curve_and_start(system, orbit, parameter, interval, scale, how)
+        integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
+        curve, start = curve_and_start(system, orbit, parameter, interval, scale, integrator)
         start, value = start.filled(), get_parameter(curve.model.system, curve.path)
         tracer = OrbitTracer(curve, max_step, max_points)
         spot = tracer.corrected(start.course, curve.pack(start, value))
@@ -224,7 +225,7 @@ class OrbitContinuation(Generic[StateT]):
         also after an interrupt."""
         curve, explorer = self._explorer.tracer.curve, self._explorer
         parts = dict(
-            how=plain(repr(curve.how)),
+            integrator=plain(repr(curve.integrator)),
             curve={f.name: getattr(curve, f.name) for f in dataclasses.fields(curve) if f.name not in GIVEN},
             t0=self._tree.start.look.begin[0],
             tracer=dict(max_step=explorer.tracer.max_step, max_points=explorer.tracer.max_points),
@@ -260,11 +261,11 @@ class OrbitContinuation(Generic[StateT]):
         or has other records.
         """
         archive = Archive(path, "OrbitContinuation", TYPES, system, y)
-        how = options(solver, stepsize_controller, max_steps)
-        if plain(repr(how)) != archive.part("how"):
+        integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
+        if plain(repr(integrator)) != archive.part("integrator"):
             raise ValueError(
                 "Arguments `solver`, `stepsize_controller` and `max_steps` must be those with which the branch was "
-                f"begun, {archive.part('how')}, but are {plain(repr(how))}."
+                f"begun, {archive.part('how')}, but are {plain(repr(integrator))}."
             )
         recorder = Recorder(record or {})
         if sorted(recorder.measures) != archive.part("record"):
@@ -274,10 +275,10 @@ class OrbitContinuation(Generic[StateT]):
             )
         given = archive.part("explorer")
         curve = OrbitCurve(
-            model=model_of(archive.system, jnp.asarray(archive.part("t0")), archive.y),
+            model=SwitchedSystem.forwards(archive.system, jnp.asarray(archive.part("t0")), archive.y),
             path=parameter_path(archive.system, given["name"]),
             like=archive.y,
-            how=how,
+            integrator=integrator,
             **archive.part("curve"),
         )
         growth = cls.__new__(cls)

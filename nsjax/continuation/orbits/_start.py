@@ -1,9 +1,7 @@
 """Where the continuation of an orbit sets out: the curve of its orbits over a parameter, and its course on it."""
 
 import dataclasses
-from typing import Any
 
-import diffrax as dfx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -11,27 +9,18 @@ import numpy as np
 from jaxtyping import Int
 
 from ..._types import Y
+from ...flow._integrator import Integrator
 from ...flow._results import is_okay
 from ...orbits._orbit import Orbit
-from ...orbits.segments._arcs import model_of
 from ...orbits.segments._equations import guard_sizes, OrbitCurve
 from ...orbits.segments._itinerary import Start, starts_of
 from ...orbits.segments._segment_flow import exactness, fits, NEVER
+from ...system._model import SwitchedSystem
 from ...system._parameter import get_parameter, parameter_path
 from ...system._system import arrays_of, System
 
 
 AT_REST = 1e-9  # a state that varies less is known to few digits only
-Options = tuple[tuple[str, Any], ...]
-
-
-def options(
-    solver: dfx.AbstractSolver, stepsize_controller: dfx.AbstractStepSizeController | None, max_steps: int
-) -> Options:
-    """The arguments of `solve` for each segment."""
-    if stepsize_controller is None:
-        stepsize_controller = dfx.PIDController(rtol=1e-12, atol=1e-12)
-    return (("solver", solver), ("stepsize_controller", stepsize_controller), ("max_steps", max_steps))
 
 
 def check_precision(orbit: Orbit) -> None:
@@ -44,7 +33,7 @@ def check_precision(orbit: Orbit) -> None:
 
 
 def curve_and_start(
-    system: System, orbit: Orbit, parameter: str, interval: tuple[float, float], scale: Y | None, how: Options
+    system: System, orbit: Orbit, parameter: str, interval: tuple[float, float], scale: Y | None, integrator: Integrator
 ) -> tuple[OrbitCurve, Start]:
     """The curve, in units of the orbit, and the orbit with its course."""
     path = parameter_path(system, parameter)
@@ -59,7 +48,7 @@ def curve_and_start(
             f"Argument `interval` must be (low, high) and hold {value:.6g}, the value of `{parameter}` in "
             f"`system`, but is ({low:.6g}, {high:.6g})."
         )
-    model = model_of(system, orbit.t0, orbit.y0)
+    model = SwitchedSystem.forwards(system, orbit.t0, orbit.y0)
     (start,) = starts_of(model, [orbit])
     sizes = sizes_of(orbit, scale)
     curve = OrbitCurve(
@@ -74,7 +63,7 @@ def curve_and_start(
         order=order_of(system, orbit),
         normal=np.zeros_like(sizes),
         reference=np.zeros_like(sizes),
-        how=how,
+        integrator=integrator,
         exact=exactness(model, jnp.asarray(orbit.t0), orbit.y0),
     )
     normal, reference = phase_of(curve, start)

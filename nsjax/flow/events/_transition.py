@@ -176,7 +176,7 @@ class _Event:
         mode = jnp.where(tip, -1, self.modes[k])
         here = ((self.state.mode[k] == 0) | self.fired[k] | (self.halted & (roots[k] > 0))) & ~tip
         roots[k] = jnp.where(tip, 1, roots[k])
-        if model.of(impact) or model.clocks:
+        if model.of_kind(impact) or model.clocks:
             # An impact may carry the state across the surface, or off it, and a tick the surface across the state: the
             # switch follows at once.
             h0 = jnp.min(jnp.stack(model.h(k, t, self.before)))
@@ -209,7 +209,7 @@ class _Event:
         model, t, state, jumped = self.model, self.t, self.mode_state(), self.after
         eps = jnp.finfo(t.dtype).eps
         brief = jnp.maximum(jnp.sqrt(eps) * (t - self.begin), 1e4 * eps * jnp.abs(t))
-        for k in model.of(impact):
+        for k in model.of_kind(impact):
             fired = self.fired[k]
             end = completed(model, k, t, self.before, jumped, self.state, state)
             ends = fired & end.possible & ((end.flight <= brief) | end.low)
@@ -262,7 +262,7 @@ class _Event:
     def relays_on_their_surfaces(self, state: ModeState, after: Y) -> ModeState:
         """The new surface of a relay may be the one just crossed (no hysteresis): then its root here is known."""
         roots = list(state.roots)
-        for k in self.model.of(relay):
+        for k in self.model.of_kind(relay):
             own = tuple(s.switch == k for s in self.model.slots)
 
             def guard(t: Scalar, y: Y, own: tuple[bool, ...] = own) -> list[Scalar]:

@@ -15,9 +15,10 @@ from ..._numerics._autodiff import dense_jacobian
 from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, THETA
 from ..._numerics._text import between, shown, written
 from ..._types import Scalar, Y
-from ...derivatives._saltation import states
+from ...flow._integrator import Integrator
+from ...flow._mode_flow import ModeFlow
 from ...flow._results import is_okay
-from ...flow._solve import solve
+from ...flow._solve import integrate
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ...system._system import System
@@ -63,20 +64,6 @@ class Path(NamedTuple):
         return f"{head}\n  states  {written(self.y, self.t.ndim)}"
 
 
-class Smooth(System):
-    """The field of one mode."""
-
-    model: SwitchedSystem
-    state: ModeState
-
-    def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
-        return self.model.flow(t, y, self.state)
-
-
-def model_of(system: System, t: Scalar, y: Y) -> SwitchedSystem:
-    return SwitchedSystem(system, jnp.ones_like(t), t, y)
-
-
 class Flows(eqx.Module):
     """The smooth flows of all arcs of a system, each divided into `pieces` of equal length."""
 
@@ -85,16 +72,16 @@ class Flows(eqx.Module):
     t0: Scalar
     y0: Y
     pieces: int = eqx.field(static=True)
-    how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    integrator: Integrator = eqx.field(static=True)
 
     @property
     def model(self) -> SwitchedSystem:
-        return model_of(self.system, self.t0, self.y0)
+        return SwitchedSystem.forwards(self.system, self.t0, self.y0)
 
     def piece(self, a: Scalar, b: Scalar, x: Array, state: ModeState, saveat: dfx.SaveAt) -> Any:
         unravel = jfu.ravel_pytree(self.y0)[1]
-        smooth = Smooth(self.model, state)
-        sol = solve(smooth, a, b, unravel(x), saveat=saveat, throw=False, **dict(self.how))
+        smooth = ModeFlow(self.model, state)
+        sol = integrate(smooth, a, b, unravel(x), self.integrator, saveat=saveat)
         flat = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys)
         return jax.tree.map(lambda y: jnp.where(is_okay(sol.result), y, jnp.nan), flat)
 
@@ -129,7 +116,7 @@ class Flows(eqx.Module):
     ) -> Minima:  # fmt: skip
         """The least values along a piece of functions `[function][part]` of time and state, each the largest of its
         parts (`below` as for `minima`)."""
-        controller = dict(self.how)["stepsize_controller"]
+        controller = self.integrator.stepsize_controller
         rtol, atol = (getattr(controller, name, 0.0) for name in ("rtol", "atol"))
         signs = np.random.default_rng(0).choice([-1.0, 1.0], x.shape)
         unit, _ = jfu.ravel_pytree(jax.tree.map(lambda y, tol: jnp.full_like(y, tol), self.y0, _spread(atol, self.y0)))
@@ -183,20 +170,18 @@ def _spread(tolerance: Any, y: Y) -> Y:
     return jax.tree.map(lambda _: tolerance, y) if jax.tree.structure(tolerance).num_leaves < 2 else tolerance
 
 
-def flows_of(
-    system: System, arcs: Arcs, how: tuple[tuple[str, Any], ...]
-) -> tuple[Flows, Float[Array, "arcs pieces n"]]:
+def flows_of(system: System, arcs: Arcs, integrator: Integrator) -> tuple[Flows, Float[Array, "arcs pieces n"]]:
     """The flows along the arcs of an orbit, and the states at the beginnings of their pieces."""
     y0, first = (jax.tree.map(lambda y, i=i: y[i], arcs.y) for i in ((0, 0), (slice(None), 0)))
-    model = model_of(system, arcs.begin[0], y0)
-    within = jax.vmap(lambda t, y, mode: states(model, t, y, tuple(mode)))(arcs.begin, first, arcs.mode)
+    model = SwitchedSystem.forwards(system, arcs.begin[0], y0)
+    within = jax.vmap(lambda t, y, mode: model.state_at(t, y, tuple(mode)))(arcs.begin, first, arcs.mode)
     x = jax.vmap(jax.vmap(lambda y: jfu.ravel_pytree(y)[0]))(arcs.y)
-    return Flows(system, within, arcs.begin[0], y0, x.shape[1], how), x
+    return Flows(system, within, arcs.begin[0], y0, x.shape[1], integrator), x
 
 
 @eqx.filter_jit
-def path_of(system: System, arcs: Arcs, samples: int, how: tuple[tuple[str, Any], ...]) -> Path:
+def path_of(system: System, arcs: Arcs, samples: int, integrator: Integrator) -> Path:
     """States along the arcs."""
-    flows, x = flows_of(system, arcs, how)
+    flows, x = flows_of(system, arcs, integrator)
     ts, xs = flows.paths(arcs.begin, arcs.end, x, samples)
     return Path(ts, jax.vmap(jax.vmap(jfu.ravel_pytree(flows.y0)[1]))(xs), arcs.mode)

@@ -16,13 +16,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._types import Scalar, Y
+from ...flow._integrator import Integrator
 from ...system._impact import impact
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ...system._parameter import Path
 from ._guess import landing
 from ._itinerary import Course, EVENT, GRAZING, REPELLING_EXIT, Start, TIME
-from ._segment_flow import ALWAYS, FREE_MODES, SegmentFlow, with_parameter
+from ._segment_flow import ALWAYS, FREE_MODES, SegmentFlow
 
 
 VANISHES = 1e-8  # an equation in the units of the unknowns
@@ -46,7 +47,7 @@ class OrbitCurve(eqx.Module):
     order: Int[Array, ""]  # periods of the forcing
     normal: Float[Array, " n"]  # the phase condition of an autonomous orbit without events
     reference: Float[Array, " n"]
-    how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    integrator: Integrator = eqx.field(static=True)
     exact: int = eqx.field(static=True)  # which flows are known by their exponentials
     slides: bool = eqx.field(static=True, default=True)  # whether surfaces hold segments of the course
 
@@ -57,7 +58,7 @@ class OrbitCurve(eqx.Module):
     @property
     def flow(self) -> SegmentFlow:
         exact = self.exact == ALWAYS or (self.exact == FREE_MODES and not self.slides)
-        return SegmentFlow(self.model, self.path, self.like, self.how, exact, self.slides)
+        return SegmentFlow(self.model, self.path, self.like, self.integrator, exact, self.slides)
 
     @property
     def autonomous(self) -> bool:
@@ -116,7 +117,7 @@ class OrbitCurve(eqx.Module):
         last segment ends, and the states at the ends."""
         begin, end, x, value = self.parts(u)
         rows = len(begin)
-        model = with_parameter(self.model, self.path, value)
+        model = self.model.with_parameter(self.path, value)
         index = jnp.arange(rows, dtype=course.num.dtype)
         happened, final = index < course.num, index == course.num - 1
         mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)

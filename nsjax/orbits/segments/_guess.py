@@ -11,16 +11,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Scalar, Y
-from ...derivatives._saltation import landed, states
+from ...derivatives._saltation import landed
 from ...derivatives._variational import arcs
+from ...flow._integrator import Integrator
+from ...flow._mode_flow import ModeFlow
 from ...flow._results import is_okay
 from ...flow._solution import Solution
-from ...flow._solve import solve
+from ...flow._solve import integrate
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ...system._system import System
 from .._guess import base_point
-from ._arcs import model_of, Smooth
 
 
 class Segment(NamedTuple):
@@ -66,7 +67,7 @@ def where(rows: Array, a: Any, b: Any) -> Any:
 def cuts_of(system: System, sol: Solution, t0: Scalar, y0: Y) -> SegmentGuess:
     """The segments of a solution, up to where it was last in the mode in which it begins."""
     begin, end, y, modes = arcs(sol, t0, y0)
-    model = model_of(system, t0, y0)
+    model = SwitchedSystem.forwards(system, t0, y0)
     events = sol.events
     index = jnp.arange(len(begin), dtype=events.num.dtype)
     steady = modes
@@ -83,14 +84,14 @@ def cuts_of(system: System, sol: Solution, t0: Scalar, y0: Y) -> SegmentGuess:
     begin, end, y, modes, last = fill(begin, end), fill(end, end), fill(y, last), fill(modes, modes), fill(last, last)
 
     def state(t: Scalar, y: Y, mode: Array) -> ModeState:
-        return states(model, t, y, tuple(mode))
+        return model.state_at(t, y, tuple(mode))
 
     switch = jnp.append(events.switch, jnp.asarray(-1, events.switch.dtype))
     within, ending = jax.vmap(state)(begin, y, modes), jax.vmap(state)(end, last, modes)
     return SegmentGuess(begin, end, y, within, ending, jnp.where(index < num, switch, -1), num, (False,) * len(begin))
 
 
-def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, how: dict) -> SegmentGuess:
+def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, integrator: Integrator) -> SegmentGuess:
     """The segments that a user wrote down, each followed in its mode for as long as was said."""
     names = [k.name for k in system.switches]
     modes = [_mode(names, s.mode) for s in segments]
@@ -109,7 +110,7 @@ def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, ho
                 f"as the modes of {len(changed)} switches change there; but got {segment.ends!r}."
             )
         switch.append(names.index(ends))
-    model = model_of(system, t0, y0)
+    model = SwitchedSystem.forwards(system, t0, y0)
     for i, segment in enumerate(segments):
         slides = i < len(switch) and switch[i] in model.holdable and switch[i] not in model.contacts
         if segment.free and not (slides and modes[i][switch[i]] == 0):
@@ -121,11 +122,11 @@ def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, ho
     def follow(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
         t, y = carry
         mode, after, k, duration = row
-        within = states(model, t, y, tuple(mode))
+        within = model.state_at(t, y, tuple(mode))
         y = model.project(t, y, within)
         end = t + duration
-        y1 = solve(Smooth(model, within), t, end, y, throw=False, **how).y1
-        ending = states(model, end, y1, tuple(mode))
+        y1 = integrate(ModeFlow(model, within), t, end, y, integrator).y1
+        ending = model.state_at(end, y1, tuple(mode))
         y_next, rest = landing(model, k, end, y1, ending, tuple(after))
         return (end + rest, y_next), (t, end, y, within, ending)
 
@@ -156,14 +157,14 @@ def _mode(names: list[str], mode: Any) -> tuple[int, ...]:
 
 @eqx.filter_jit
 def cuts_near(
-    system: System, t0: Scalar, y0: Y, period: Scalar, order: int, mode: Any, how: dict
+    system: System, t0: Scalar, y0: Y, period: Scalar, order: int, mode: Any, integrator: Integrator
 ) -> tuple[SegmentGuess, Bool[Array, ""]]:
     """The segments of the solution from a guess, and whether it came back to the mode in which it begins."""
     if system.period is None:
-        y0, period, mode = base_point(system, t0, y0, period, 1.0, mode, how)
+        y0, period, mode = base_point(system, t0, y0, period, 1.0, mode, integrator)
     else:
         period = jnp.asarray(system.period, t0.dtype) * order
-    sol = solve(system, t0, t0 + period, y0, mode=mode, throw=False, **how)
+    sol = integrate(system, t0, t0 + period, y0, integrator, mode=mode)
     cuts = cuts_of(system, sol, t0, y0)
     return cuts, is_okay(sol.result) & ((cuts.num > 0) | (sol.events.num == 0))
 

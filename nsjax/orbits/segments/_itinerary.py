@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._types import Scalar, Y
-from ...derivatives._saltation import states
 from ...flow._solution import Events
 from ...system._model import SwitchedSystem
 from ...system._sgn import sgn
@@ -129,9 +128,9 @@ def _looked_at(model: SwitchedSystem, like: Y, systems: System, diaries: EventRe
         return jnp.stack([jnp.argmin(jnp.abs(jnp.stack(h))) if len(h) > 1 else jnp.zeros((), int) for h in each])
 
     def event(system: System, t: Scalar, switch: Array, modes: Any, rows: Any) -> tuple[Array, Array, Array]:
-        here = eqx.tree_at(lambda m: m.system, model, system)
+        here = model.with_system(system)
         before, after = map(unravel, rows)
-        values = here.values(t, before, states(here, t, before, tuple(modes[0])))
+        values = here.values(t, before, here.state_at(t, before, tuple(modes[0])))
         holdable = jnp.asarray([k in here.holdable for k in range(len(here.switches))])
         multiplier = jnp.where(holdable, jnp.stack(values), 0)[switch]
         return nearest(here, t, before), nearest(here, t, after), multiplier

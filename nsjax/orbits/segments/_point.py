@@ -10,14 +10,13 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, RESOLVED
-from ..._numerics._root import find_root
+from ..._numerics._root import find_root, Newton
 from ..._types import Scalar
 from ...derivatives._floquet import floquet, structural_zeros
 from ...system._model import SwitchedSystem
 from ...system._relay import relay
 from ._equations import OrbitCurve, row_sizes
 from ._itinerary import Course, EVENT, REPELLING_EXIT, TIME
-from ._segment_flow import with_parameter
 
 
 TOLERANCE = 1e-12  # of Newton's method, in units of the unknowns
@@ -103,7 +102,7 @@ def step_on(
         off = jnp.append(curve.residual(u, course, origin)[0], border @ (u - origin) - s)
         return jnp.where(newton, off, u - guess)
 
-    u, good = find_root(residual, guess, None, TOLERANCE, 10)
+    u, good = find_root(residual, guess, None, Newton(TOLERANCE, 10))
     return look_at(curve, u, border, course, origin, good, turns)
 
 
@@ -112,7 +111,7 @@ def look_at(
 ) -> PointData:
     begin, end, x, value = curve.parts(u)
     n, rows, m = len(curve.sizes), len(begin), curve.dimension
-    model = with_parameter(curve.model, curve.path, value)
+    model = curve.model.with_parameter(curve.path, value)
 
     def equations(u: Array) -> tuple[tuple[Array, Scalar], tuple[Array, Array]]:
         f, arrival, last = curve.residual(u, course, origin)
@@ -200,7 +199,7 @@ def _infinitely_unstable(n: int, autonomous: bool) -> tuple[Array, Array, Array]
 def extremes(curve: OrbitCurve, course: Course, u: Array) -> tuple[Array, Array]:
     """The least and the largest value of each component of the state along an orbit."""
     begin, end, x, value = curve.parts(u)
-    model = with_parameter(curve.model, curve.path, value)
+    model = curve.model.with_parameter(curve.path, value)
     found = _along(curve, model, value, begin, end, x, course, turns=True, guards=False).least
     inside = jnp.arange(len(begin), dtype=course.num.dtype) < course.num
     low, high = jnp.min(jnp.where(inside[:, None], found, jnp.inf), axis=0).reshape(2, -1)

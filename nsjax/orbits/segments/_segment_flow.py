@@ -16,21 +16,17 @@ from jaxtyping import Array, Float
 
 from ..._numerics._minima import NODES, THETA, WEIGHTS
 from ..._types import Scalar, Y
+from ...flow._integrator import Integrator
+from ...flow._mode_flow import ModeFlow, VariedModeFlow
 from ...flow._results import is_okay
-from ...flow._solve import solve
+from ...flow._solve import integrate
 from ...flow.steppers._exponential import affine_parts, expm, generator
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
-from ...system._parameter import Path, put_parameter
-from ...system._system import System
-from ._arcs import Smooth
+from ...system._parameter import Path
 
 
 NEVER, FREE_MODES, ALWAYS = range(3)  # when a mode's flow is known by its exponential
-
-
-def with_parameter(model: SwitchedSystem, path: Path, value: Array) -> SwitchedSystem:
-    return eqx.tree_at(lambda m: m.system, model, put_parameter(model.system, path, value))
 
 
 class SegmentFlow(eqx.Module):
@@ -39,7 +35,7 @@ class SegmentFlow(eqx.Module):
     model: SwitchedSystem
     path: Path = eqx.field(static=True)
     like: Y
-    how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    integrator: Integrator = eqx.field(static=True)
     exact: bool = eqx.field(static=True)
     slides: bool = eqx.field(static=True)  # whether modes that are held occur
 
@@ -47,7 +43,7 @@ class SegmentFlow(eqx.Module):
         return jfu.ravel_pytree(self.like)[1](x)
 
     def field(self, t: Scalar, x: Array, value: Array, state: ModeState) -> Array:
-        model = with_parameter(self.model, self.path, value)
+        model = self.model.with_parameter(self.path, value)
         if self.exact and not self.slides:
             model = model.within(state.mode)
             return jfu.ravel_pytree(model.field(t, self.unravel(x), model.signs(t, state)))[0]
@@ -55,7 +51,7 @@ class SegmentFlow(eqx.Module):
 
     def generator(self, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> tuple:
         """Of the exact flow from time a to b, see `generator`."""
-        model = with_parameter(self.model, self.path, value)
+        model = self.model.with_parameter(self.path, value)
         force = model.force(a, self.unravel(x), state) if self.slides else None
         f = self.field(a, x, value, state)
         return generator(lambda t, x: self.field(t, x, value, state), a, x, f, b - a, force)
@@ -78,8 +74,8 @@ class SegmentFlow(eqx.Module):
         far = jnp.where(span > 0, b, jnp.nextafter(a, jnp.inf))
         none = jax.tree.map(jnp.zeros_like, self.like)
         saveat = dfx.SaveAt(subs=dfx.SubSaveAt(ts=jnp.where(span > 0, ts, a), fn=lambda t, y, args: y[0]))
-        summed = _Summed(with_parameter(self.model, self.path, value), state)
-        sol = solve(summed, a, far, (self.unravel(x), none, none), saveat=saveat, throw=False, **dict(self.how))
+        summed = _Summed(self.model.with_parameter(self.path, value), state)
+        sol = integrate(summed, a, far, (self.unravel(x), none, none), self.integrator, saveat=saveat)
         xs = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys)
         sums = jnp.stack([jfu.ravel_pytree(part)[0] for part in sol.y1[1:]])
         return ts, jnp.where(span > 0, xs, x), jnp.where(span > 0, sums, 0)
@@ -106,33 +102,12 @@ def fits(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state:
     return jnp.all(jax.vmap(at)(a + (b - a) * jnp.asarray([0.0, 0.2764, 0.6180], x.dtype)))
 
 
-class _Summed(System):
+class _Summed(ModeFlow):
     """The field of one mode, and the integrals of the state and of its squares."""
-
-    model: SwitchedSystem
-    state: ModeState
 
     def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
         y, _, _ = y
         return self.model.flow(t, y, self.state), y, jax.tree.map(jnp.square, y)
-
-
-class _Varied(System):
-    """A state, the parameter, and the derivatives of the state by those at the beginning, in one mode."""
-
-    model: SwitchedSystem
-    path: Path = eqx.field(static=True)
-    state: ModeState
-
-    def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
-        y, value, columns = y
-
-        def rhs(y: Y, value: Array) -> Y:
-            return with_parameter(self.model, self.path, value).flow(t, y, self.state)
-
-        along, moved = columns
-        change = jax.vmap(lambda dy, dv: jax.jvp(rhs, (y, value), (dy, dv))[1])(along, moved)
-        return rhs(y, value), jnp.zeros_like(value), (change, jnp.zeros_like(moved))
 
 
 def _exponential(
@@ -180,8 +155,8 @@ def _hermite(s: np.ndarray) -> np.ndarray:
 def _arrive(flow: SegmentFlow, a: Any, b: Any, x: Any, value: Any, state: Any) -> Array:
     if flow.exact:
         return _exponential(flow, a, b, x, value, state)[0]
-    smooth = Smooth(with_parameter(flow.model, flow.path, value), state)
-    sol = solve(smooth, a, b, flow.unravel(x), saveat=dfx.SaveAt(t1=True), throw=False, **dict(flow.how))
+    smooth = ModeFlow(flow.model.with_parameter(flow.path, value), state)
+    sol = integrate(smooth, a, b, flow.unravel(x), flow.integrator)
     return jnp.where(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0], jnp.nan)
 
 
@@ -217,12 +192,10 @@ def _varied(
         by_value, (out, by_x) = jax.jacfwd(end, has_aux=True)(value)
         return out, by_x, by_value.reshape(n, -1)
     eye = jnp.eye(n + value.size, dtype=x.dtype)
-    columns = (jax.vmap(flow.unravel)(eye[:, :n]), eye[:, n:].reshape(-1, *value.shape))
-    varied = _Varied(flow.model, flow.path, state)
-    sol = solve(
-        varied, a, b, (flow.unravel(x), value, columns), saveat=dfx.SaveAt(t1=True), throw=False, **dict(flow.how)
-    )
-    y, _, (along, _) = sol.y1
+    varied = VariedModeFlow(flow.model, state, flow.path, value, eye[:, n:].reshape(-1, *value.shape))
+    columns = jax.vmap(flow.unravel)(eye[:, :n])
+    sol = integrate(varied, a, b, (flow.unravel(x), columns), flow.integrator)
+    y, along = sol.y1
     out = jnp.where(is_okay(sol.result), jfu.ravel_pytree(y)[0], jnp.nan)
     phi = jax.vmap(lambda c: jfu.ravel_pytree(c)[0], out_axes=1)(along)
     return out, phi[:, :n], phi[:, n:]

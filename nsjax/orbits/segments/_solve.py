@@ -4,8 +4,6 @@ Each segment is a smooth flow in a mode that is given. So the equations stay wel
 surface that repels, and for orbits that no solution follows for a whole period.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
@@ -14,10 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from ..._numerics._autodiff import frozen
-from ..._numerics._root import find_root
+from ..._numerics._root import find_root, Newton
 from ..._types import Scalar, Y
 from ...derivatives._floquet import floquet, forwards, structural_zeros
 from ...derivatives._saltation import fired, saltation_matrices
+from ...flow._integrator import Integrator
 from ...flow._results import is_okay, RESULTS
 from ...flow._solution import Events
 from ...flow.events._locate import cosine
@@ -25,7 +24,7 @@ from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ...system._system import System
 from .._orbit import fractions, judge, Orbit, ravel
-from ._arcs import Arcs, Flows, model_of, SAMPLES
+from ._arcs import Arcs, Flows, SAMPLES
 from ._guess import landing, SegmentGuess, where
 
 
@@ -55,7 +54,7 @@ class _Cycle(eqx.Module):
     y0: Y
     order: int = eqx.field(static=True)
     pieces: int = eqx.field(static=True)
-    how: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    integrator: Integrator = eqx.field(static=True)
 
     @property
     def index(self) -> Int[Array, " rows"]:
@@ -74,11 +73,11 @@ class _Cycle(eqx.Module):
         return jfu.ravel_pytree(self.y0)[1](x)
 
     def flows(self, system: System, pieces: int | None = None) -> Flows:
-        return Flows(system, self.cuts.within, self.t0, self.y0, pieces or self.pieces, self.how)
+        return Flows(system, self.cuts.within, self.t0, self.y0, pieces or self.pieces, self.integrator)
 
     def conditions(self, system: System, begin: Array, end: Array, first: Array, last: Array) -> tuple[Array, Array]:
         """What vanishes at the end of every segment, and what does at the beginning of those that are free."""
-        model, cuts = model_of(system, self.t0, self.y0), self.cuts
+        model, cuts = SwitchedSystem.forwards(system, self.t0, self.y0), self.cuts
         at_end = jax.vmap(lambda k, t, x, s: _guard(model, k, t, self.unravel(x), s))
         at_end = at_end(cuts.switch, end, last, cuts.ending)
         if not any(cuts.free):
@@ -88,7 +87,7 @@ class _Cycle(eqx.Module):
 
     def jumps(self, system: System, end: Array, last: Array) -> tuple[Array, Array]:
         """The states after the events, and the times up to where impacts have come to rest."""
-        model = model_of(system, self.t0, self.y0)
+        model = SwitchedSystem.forwards(system, self.t0, self.y0)
 
         def row(k: Array, t: Scalar, x: Array, ending: ModeState, after: tuple) -> tuple[Array, Scalar]:
             y, rest = landing(model, k, t, self.unravel(x), ending, after)
@@ -103,7 +102,7 @@ class _Cycle(eqx.Module):
         begin, end, first = cuts.begin, cuts.end, jax.vmap(ravel)(cuts.y)
         _, xs = self.flows(system, 1).paths(begin, end, first[:, None])
         x = xs[:, :: SAMPLES // self.pieces][:, : self.pieces] if self.pieces > 1 else first[:, None]
-        model = model_of(system, self.t0, self.y0)
+        model = SwitchedSystem.forwards(system, self.t0, self.y0)
         field = jax.vmap(lambda t, x, s: ravel(model.flow(t, self.unravel(x), s)))
         now = (begin, end, first, xs[:, -1])
         one = jnp.ones_like(begin)
@@ -139,25 +138,31 @@ class _Cycle(eqx.Module):
 
 @eqx.filter_jit
 def by_segments(
-    system: System, cuts: SegmentGuess, t0: Scalar, order: int, pieces: int, how: dict, tol: float, max_iterations: int
+    system: System,
+    cuts: SegmentGuess,
+    t0: Scalar,
+    order: int,
+    pieces: int,
+    integrator: Integrator,
+    newton: Newton,
 ) -> Orbit:
     """Newton's method on the equations of all segments, and what is said of the orbit."""
     autonomous = system.period is None
     still = frozen(system)
     cuts = frozen(cuts)
     y0 = jax.tree.map(lambda x: x[0], cuts.y)
-    cycle = _Cycle(cuts, t0, y0, order, pieces, tuple(how.items()))
+    cycle = _Cycle(cuts, t0, y0, order, pieces, integrator)
     guess, rates, normal = frozen(cycle).first_look(still)
 
     def residual(z: tuple, parameters: tuple) -> tuple:
         system, cycle = parameters
         return cycle.residual(z, system, rates, normal)
 
-    z, converged = find_root(residual, guess, (system, cycle), tol, max_iterations)
+    z, converged = find_root(residual, guess, (system, cycle), newton)
     begin, end, x = z
     error = jnp.max(jnp.abs(jnp.concatenate([r.ravel() for r in residual(frozen(z), (still, cycle))])))
     size = 1 + jnp.max(jnp.abs(x))
-    good = converged & (error <= 1e3 * tol * size)
+    good = converged & (error <= 1e3 * newton.tol * size)
     period = end[-1] - t0 if autonomous else jnp.asarray(system.period, t0.dtype) * order
     _, shares = fractions(autonomous, order)
     here = lax.stop_gradient((begin, end, x))
@@ -171,7 +176,7 @@ def by_segments(
     meant = jnp.roll(jnp.asarray(cuts.free), -1)
     grazes = jnp.any(cycle.happened & ~meant & (events.transversality < jnp.cbrt(jnp.finfo(end.dtype).eps)))
     violation, violation_t = _violation(still, cycle, *here)
-    admissible = (violation == 0) & jnp.all(end - begin >= -1e3 * tol * (1 + jnp.abs(period)))
+    admissible = (violation == 0) & jnp.all(end - begin >= -1e3 * newton.tol * (1 + jnp.abs(period)))
     result = RESULTS.where((result == RESULTS.successful) & grazes, RESULTS.tangential_event, result)
     result = RESULTS.where(is_okay(result) & ~admissible, RESULTS.orbit_not_admissible, result)
     return Orbit(
@@ -191,7 +196,7 @@ def by_segments(
         violation_t=violation_t,
         result=result,
         arcs=Arcs(begin, end, _modes(cuts.within.mode, begin), jax.vmap(jax.vmap(cycle.unravel))(x)),
-        options=tuple(how.items()),
+        integrator=integrator,
     )
 
 
@@ -203,7 +208,7 @@ def _log(system: System, cycle: _Cycle, end: Array, last: Array) -> Events:
     """The events between the segments."""
     cuts, happened, following, unravel = cycle.cuts, cycle.happened, cycle.following, cycle.unravel
     after, rest = cycle.jumps(system, end, last)
-    model = model_of(system, end[0], unravel(last[0]))
+    model = SwitchedSystem.forwards(system, end[0], unravel(last[0]))
 
     def square(k: Array, t: Scalar, x: Array, s: ModeState) -> Scalar:
         h_t, n = jax.grad(lambda t, x: _guard(model, k, t, unravel(x), s), argnums=(0, 1))(t, x)
@@ -254,7 +259,7 @@ def _floquet(system: System, cycle: _Cycle, events: Events, phi: Array) -> tuple
 
 def _violation(system: System, cycle: _Cycle, begin: Array, end: Array, x: Array) -> tuple[Scalar, Scalar]:
     """By how much the guards of the modes are violated, and when: beyond what the tolerance makes of them."""
-    model, cuts, flows = model_of(system, cycle.t0, cycle.y0), cycle.cuts, cycle.flows(system)
+    model, cuts, flows = SwitchedSystem.forwards(system, cycle.t0, cycle.y0), cycle.cuts, cycle.flows(system)
     if not model.slots:
         return jnp.zeros_like(begin[0]), begin[0]
     starts = begin[:, None] + (end - begin)[:, None] * jnp.arange(cycle.pieces, dtype=end.dtype) / cycle.pieces

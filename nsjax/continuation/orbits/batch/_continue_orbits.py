@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ...._numerics._text import shown
 from ...._types import Y
+from ....flow._integrator import Integrator
 from ....flow._results import is_okay
 from ....orbits._find_orbit import find_orbit
 from ....orbits._orbit import Orbit
@@ -23,7 +24,7 @@ from ....orbits.segments._point import extremes
 from ....sweeps._sweep import sweep
 from ....system._parameter import get_parameter, parameter_path, put_parameter
 from ....system._system import arrays_of, System
-from .._start import check_precision, curve_and_start, options, order_of, phase_of
+from .._start import check_precision, curve_and_start, order_of, phase_of
 from .._test_functions import BRANCH, PASSED, Test
 from ._lane import EACH, ENDED, follow_lane, Lane, lane_tests, LOST, NO_ORBIT
 
@@ -136,7 +137,7 @@ def continue_orbits(
 
     **Raises:** `ValueError` for an unknown parameter, in single precision, or if no lane has an orbit to start from.
     """
-    how = options(solver, stepsize_controller, max_steps)
+    integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
     each = list(orbits) if isinstance(orbits, Sequence) else _unstacked(orbits)
     for one in each:
         check_precision(one)
@@ -146,7 +147,7 @@ def continue_orbits(
     if not any(good):
         raise ValueError("Argument `orbits` must hold an orbit that was found, within `interval`, but none is.")
     first = good.index(True)
-    curve, _ = curve_and_start(each[first].system, each[first], parameter, interval, scale, how)
+    curve, _ = curve_and_start(each[first].system, each[first], parameter, interval, scale, integrator)
     own = [i for i, one in enumerate(good) if one]
     starts = dict(zip(own, starts_of(curve.model, [each[i] for i in own])))
     # One program for all: with the flows of modes that surfaces hold, if there are any.
@@ -179,7 +180,7 @@ class _Lane(NamedTuple):
 
 def _lane_of(curve: OrbitCurve, orbit: Orbit, start: Start, capacity: int) -> _Lane:
     system = arrays_of(orbit.system, jnp.float64)
-    own = dataclasses.replace(curve, model=eqx.tree_at(lambda m: m.system, curve.model, system))
+    own = dataclasses.replace(curve, model=curve.model.with_system(system))
     normal, reference = phase_of(own, start)
     start = start._replace(course=start.course.take(list(start.course.rows), capacity))
     u = curve.pack(start, get_parameter(system, curve.path))
@@ -209,7 +210,7 @@ class _Extremes(eqx.Module):
 
 
 def _curve_of(curve: OrbitCurve, lane: _Lane) -> OrbitCurve:
-    system = eqx.tree_at(lambda m: m.system, curve.model, lane.system)
+    system = curve.model.with_system(lane.system)
     return dataclasses.replace(curve, model=system, order=lane.order, normal=lane.normal, reference=lane.reference)
 
 

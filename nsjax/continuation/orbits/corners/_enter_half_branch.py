@@ -11,7 +11,6 @@ import numpy as np
 from ....maps._corner_normal_form import CornerMap, Cycle
 from ....orbits.segments._equations import OrbitCurve
 from ....orbits.segments._itinerary import EventRecord, same_course, Start, starts_from
-from ....orbits.segments._segment_flow import with_parameter
 from .._branch_switching import admissible, Half, together, tracer_for, with_order
 from .._test_functions import PASSED
 from .._tracer import Arc, OrbitPoint, OrbitTracer, turned
@@ -103,7 +102,7 @@ def _foretold(curve: OrbitCurve, spot: OrbitPoint, points: list[Base], cycle: Cy
     _, _, events, good = jax.device_get(follow(curve, xs, values, reference, begins, stops, held))
     if not np.all(good[:count]):
         return None
-    here, there = (with_parameter(curve.model, curve.path, jnp.asarray(v)).system for v in (spot.parameter, value))
+    here, there = (curve.model.with_parameter(curve.path, jnp.asarray(v)).system for v in (spot.parameter, value))
     slow = 1.0 if curve.autonomous else float(there.period) / float(here.period)
     diaries = []
     for lane in range(count):

@@ -10,7 +10,6 @@ import numpy as np
 from ...._numerics._bracket import bracketed
 from ....orbits.segments._equations import OrbitCurve
 from ....orbits.segments._itinerary import capacity_for, Course, EVENT, GRAZING, Start, TIME
-from ....orbits.segments._segment_flow import with_parameter
 from ....system._impact import impact
 from .._test_functions import Test
 from .._tracer import alike, OrbitPoint, OrbitTracer, Zero
@@ -140,7 +139,7 @@ def cut_course(
 
 def _component(curve: OrbitCurve, look: Any, course: Course, i: int, j: int, t: float) -> int:
     """Of a guard with several components that which is least there: at a tip another one takes over."""
-    model = with_parameter(curve.model, curve.path, jnp.asarray(look.parameter))
+    model = curve.model.with_parameter(curve.path, jnp.asarray(look.parameter))
     state = curve.state(jnp.asarray(course.mode[i]), jnp.asarray(course.part[i]))
     at = jnp.asarray(look.spots[i, j])
     when = jnp.asarray(t)

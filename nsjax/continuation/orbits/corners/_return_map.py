@@ -7,7 +7,6 @@ no finite distance would do.
 
 from typing import Any, NamedTuple
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
@@ -16,10 +15,9 @@ import numpy as np
 
 from ....flow._results import is_okay
 from ....flow._solution import Events
-from ....flow._solve import solve
+from ....flow._solve import integrate
 from ....maps._corner_normal_form import CornerMap
 from ....orbits.segments._equations import OrbitCurve
-from ....orbits.segments._segment_flow import with_parameter
 from ....system._parameter import put_parameter
 from .._tracer import midpoint
 
@@ -73,10 +71,9 @@ def follow(
             if not curve.autonomous:
                 still = put_parameter(curve.model.system, curve.path, reference)
                 slow = jnp.asarray(system.period, a.dtype) / jnp.asarray(still.period, a.dtype)
-            sol = solve(
-                system, a * slow, b * slow, curve.unravel(z[:-1]), mode=tuple(mode) if curve.model.switches else None,
-                saveat=dfx.SaveAt(t1=True), max_events=MAX_EVENTS, throw=False, **dict(curve.how),
-            )  # fmt: skip
+            given = tuple(mode) if curve.model.switches else None
+            integrator = curve.integrator._replace(max_events=MAX_EVENTS)
+            sol = integrate(system, a * slow, b * slow, curve.unravel(z[:-1]), integrator, mode=given)
             end = jfu.ravel_pytree(sol.y1)[0]
             return end, (end, sol.events, is_okay(sol.result))
 
@@ -154,7 +151,7 @@ def frame(curve: OrbitCurve, spot: Any, base: Base) -> np.ndarray:
     n = len(curve.sizes)
     if not curve.autonomous:
         return np.eye(n)
-    model = with_parameter(curve.model, curve.path, jnp.asarray(spot.look.parameter))
+    model = curve.model.with_parameter(curve.path, jnp.asarray(spot.look.parameter))
     part = np.zeros(len(base.mode), np.int32)
     state = curve.state(jnp.asarray(base.mode), jnp.asarray(part))
     f = np.asarray(jfu.ravel_pytree(model.flow(jnp.asarray(base.t), curve.unravel(jnp.asarray(base.x)), state))[0])

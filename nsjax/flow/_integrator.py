@@ -1,0 +1,110 @@
+"""How solutions are computed: the method and its bounds, for `solve` and for all that is built on it."""
+
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+from diffrax._root_finder import use_stepsize_tol
+from jax.core import Tracer
+
+from .steppers._exponential import Exponential
+
+
+class Integrator(NamedTuple):
+    """Those arguments of `solve` that say how, and not what."""
+
+    solver: dfx.AbstractSolver
+    stepsize_controller: Any  # None until `checked`: by default
+    max_steps: int = 4096
+    max_events: int = 256
+    adjoint: dfx.AbstractAdjoint = dfx.ForwardMode()
+
+    def checked(self, dtype: Any, tolerance: tuple[float, float] = (1e-8, 1e-5)) -> "Integrator":
+        """The same with a step size controller, and with a solver, as the loop needs them.
+
+        **Arguments:**
+
+        - `dtype`: that of the state.
+        - `tolerance`: the default, in double and in single precision.
+        """
+        solver, adjoint = self.solver, self.adjoint
+        if not isinstance(solver, dfx.AbstractSolver):
+            raise TypeError(
+                f"Argument `solver` must be a diffrax solver such as `diffrax.Tsit5()`, but got {solver!r}."
+            )
+        for name, value in (("max_steps", self.max_steps), ("max_events", self.max_events)):
+            if not isinstance(value, int) or value < 1:
+                raise ValueError(f"Argument `{name}` must be a positive integer, but got {value!r}.")
+        if isinstance(solver, Exponential) and isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
+            raise ValueError(
+                "Argument `adjoint` must not be `RecursiveCheckpointAdjoint` for `Exponential`, whose matrix "
+                "exponential is a loop of unknown length; use `diffrax.DirectAdjoint()`."
+            )
+        controller = _controller(self.stepsize_controller, dtype, tolerance)
+        return self._replace(solver=_implicit(solver, controller, adjoint), stepsize_controller=controller)
+
+    def with_arrays(self, dtype: Any) -> "Integrator":
+        """The same with tolerances that are arrays, so that a new one is no new program."""
+        controller = self.stepsize_controller
+        plain = [n for n in ("rtol", "atol") if isinstance(getattr(controller, n, None), (int, float))]
+        controller = eqx.tree_at(
+            lambda c: [getattr(c, n) for n in plain],
+            controller,
+            [jnp.asarray(getattr(controller, n), dtype) for n in plain],
+        )
+        return self._replace(stepsize_controller=controller)
+
+
+def _implicit(solver: Any, controller: Any, adjoint: Any) -> Any:
+    """Gives an implicit solver's root finder the tolerances of the step size controller, and the solver a kind of loop
+    that can be differentiated, as diffrax does."""
+    if not isinstance(solver, dfx.AbstractImplicitSolver):
+        return solver
+    open_ = [n for n in ("rtol", "atol", "norm") if getattr(solver.root_finder, n) is use_stepsize_tol]
+    if open_ and not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
+        raise ValueError(
+            "Argument `stepsize_controller` must be adaptive for an implicit solver whose root finder has no "
+            "tolerances, but got a fixed one. Use `diffrax.PIDController(rtol=..., atol=...)`, or pass "
+            "`root_finder=diffrax.VeryChord(rtol=..., atol=..., norm=optimistix.max_norm)` to the solver."
+        )
+    if getattr(solver, "scan_kind", "") is None and not isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
+        solver = eqx.tree_at(lambda s: s.scan_kind, solver, "lax", is_leaf=lambda x: x is None)
+    return eqx.tree_at(
+        lambda s: [getattr(s.root_finder, n) for n in open_], solver, [getattr(controller, n) for n in open_]
+    )
+
+
+def _controller(controller: Any, dtype: Any, tolerance: tuple[float, float]) -> dfx.AbstractStepSizeController:
+    eps = float(jnp.finfo(dtype).eps)
+    if controller is None:
+        tol = tolerance[0] if eps < 1e-10 else tolerance[1]
+        return dfx.PIDController(rtol=tol, atol=tol)
+    if not isinstance(controller, dfx.AbstractStepSizeController):
+        raise TypeError(
+            "Argument `stepsize_controller` must be a diffrax step size controller, such as "
+            f"`diffrax.PIDController(rtol=1e-8, atol=1e-8)`, but got {controller!r}."
+        )
+    values = {n: getattr(controller, n, None) for n in ("rtol", "atol")}
+    values = {n: float(x) for n, x in values.items() if eqx.is_array_like(x) and not isinstance(x, Tracer)}
+    for name, value in values.items():
+        if not value >= 0:
+            raise ValueError(f"Argument `stepsize_controller` must have {name} >= 0, but got {name} = {value}.")
+    if len(values) == 2 and not any(values.values()):
+        raise ValueError("Argument `stepsize_controller` must have a tolerance above zero, but rtol = atol = 0.")
+    rtol = getattr(controller, "rtol", None)
+    # A step of size one is rounded by about eps; its error estimate by a few times that. (Inside `jit` the
+    # tolerance may have no value yet.)
+    least = 8 * eps
+    known = eqx.is_array_like(rtol) and not isinstance(rtol, Tracer)
+    if known and 0 < float(rtol) < least:
+        cure = (
+            "Call `jax.config.update('jax_enable_x64', True)` and pass float64 values, or loosen the tolerance."
+            if eps > 1e-10
+            else "Loosen the tolerance."
+        )
+        raise ValueError(
+            f"Argument `stepsize_controller` must have a tolerance that {dtype} can hold (rtol >= {least:.1e}), but "
+            f"got rtol = {float(rtol):.1e}. {cure}"
+        )
+    return controller
