@@ -13,7 +13,7 @@ import numpy as np
 from .._numerics._autodiff import dense_jacobian, forward_only
 from .._numerics._root import Newton
 from .._numerics._text import known, suggesting, written
-from .._types import StateT, Y
+from .._types import Scalar, StateT, Y
 from ..flow._arguments import check_numbers, checked_start
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, raise_if, RESULTS, SolveError
@@ -106,46 +106,17 @@ def find_orbit(
     together; a runtime error that says whether the search ended in an equilibrium, in a multiple cover of a shorter
     orbit, or nowhere.
     """
-    if order is not None and (not isinstance(order, int) or order < 1):
-        raise ValueError(f"Argument `order` must be a positive integer or None, but got {order!r}.")
     t0, y0, given = checked_start(system, t0, y0, mode)
     integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, (1e-12, 1e-6))
     tol = (1e-10 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4) if tol is None else tol
-    if method not in (None, "shooting", "segments"):
-        raise ValueError(f"Argument `method` must be 'shooting' or 'segments', but got {method!r}.")
-    if symmetry is not None and (method == "segments" or segments is not None or pieces != 1):
-        raise ValueError("Argument `symmetry` is for `method='shooting'`, but segments are asked for.")
-    if symmetry == "inversion":
-        symmetry = _inversion
-    if symmetry is not None and not callable(symmetry):
-        raise ValueError(f"Argument `symmetry` must be a function or 'inversion', but got {symmetry!r}.")
-    if backward and (method == "segments" or segments is not None or pieces != 1):
-        raise ValueError("Argument `backward` is for `method='shooting'`, but segments are asked for.")
-    if method == "shooting" and (segments is not None or pieces != 1):
-        raise ValueError("Arguments `segments` and `pieces` are for `method='segments'`, but it is 'shooting'.")
-    if not isinstance(pieces, int) or not 1 <= pieces <= 64:
-        raise ValueError(f"Argument `pieces` must be an integer from 1 to 64, but got {pieces!r}.")
+    symmetry = _inversion if symmetry == "inversion" else symmetry
+    _check_method(method, symmetry, backward, segments, pieces, adjoint)
     check_direction(system, backward)
     if throw:
         check_numbers(system, t0, t0, y0)
     system = arrays_of(system, t0.dtype)
-    autonomous = system.period is None
-    if autonomous:
-        check_autonomous(system, t0, y0)
-    else:
-        check_clocks(system)
-    if not autonomous and period is not None:
-        raise ValueError("Argument `period` must not be given for a forced system; use `order` for a subharmonic.")
-    if autonomous and order not in (1, None):
-        raise ValueError("Argument `order` must be 1 for an autonomous system; pass the longer `period` instead.")
-    if not isinstance(adjoint, dfx.ForwardMode | dfx.DirectAdjoint):
-        raise ValueError(
-            "Argument `adjoint` must be `diffrax.ForwardMode()` or `diffrax.DirectAdjoint()`, but got "
-            f"{type(adjoint).__name__}."
-        )
     concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, t0, y0, period)))
-    if order is None and not autonomous and not concrete:
-        raise ValueError("Argument `order` must be given under `jit` and `vmap`: finding it out needs concrete values.")
+    _check_period(system, t0, y0, period, order, concrete)
     search = Search(
         t0=t0,
         order=order,
@@ -172,6 +143,46 @@ def find_orbit(
         last = f"t = {float(orbit.t0):.6g}, {written(orbit.y0)}, period {float(orbit.period):.6g}"
         raise SolveError(f"{RESULTS[orbit.result]} (The search ended at {last}.)")
     return raise_if(~is_okay(orbit.result), orbit.result, orbit) if throw else orbit
+
+
+def _check_method(
+    method: Any, symmetry: Any, backward: bool, segments: Sequence[Segment] | None, pieces: Any, adjoint: Any
+) -> None:
+    """Checks what belongs to one of the two formulations only."""
+    if method not in (None, "shooting", "segments"):
+        raise ValueError(f"Argument `method` must be 'shooting' or 'segments', but got {method!r}.")
+    in_segments = method == "segments" or segments is not None or pieces != 1
+    if symmetry is not None and in_segments:
+        raise ValueError("Argument `symmetry` is for `method='shooting'`, but segments are asked for.")
+    if symmetry is not None and not callable(symmetry):
+        raise ValueError(f"Argument `symmetry` must be a function or 'inversion', but got {symmetry!r}.")
+    if backward and in_segments:
+        raise ValueError("Argument `backward` is for `method='shooting'`, but segments are asked for.")
+    if method == "shooting" and in_segments:
+        raise ValueError("Arguments `segments` and `pieces` are for `method='segments'`, but it is 'shooting'.")
+    if not isinstance(pieces, int) or not 1 <= pieces <= 64:
+        raise ValueError(f"Argument `pieces` must be an integer from 1 to 64, but got {pieces!r}.")
+    if not isinstance(adjoint, dfx.ForwardMode | dfx.DirectAdjoint):
+        raise ValueError(
+            "Argument `adjoint` must be `diffrax.ForwardMode()` or `diffrax.DirectAdjoint()`, but got "
+            f"{type(adjoint).__name__}."
+        )
+
+
+def _check_period(system: System, t0: Scalar, y0: Y, period: Any, order: Any, concrete: bool) -> None:
+    """Checks period and order, which mean one thing for forced systems and another for autonomous ones."""
+    if order is not None and (not isinstance(order, int) or order < 1):
+        raise ValueError(f"Argument `order` must be a positive integer or None, but got {order!r}.")
+    if system.period is None:
+        check_autonomous(system, t0, y0)
+        if order not in (1, None):
+            raise ValueError("Argument `order` must be 1 for an autonomous system; pass the longer `period` instead.")
+        return
+    check_clocks(system)
+    if period is not None:
+        raise ValueError("Argument `period` must not be given for a forced system; use `order` for a subharmonic.")
+    if order is None and not concrete:
+        raise ValueError("Argument `order` must be given under `jit` and `vmap`: finding it out needs concrete values.")
 
 
 def find_orbits(

@@ -82,9 +82,8 @@ def _shoot(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scalar
     model = SwitchedSystem.forwards(still, t_still, guess)
     normal = None
     if autonomous:
-        guess, first_period, mode = lax.stop_gradient(
-            base_point(still, t_still, guess, first_period, sign, mode, integrator)
-        )
+        base = base_point(still, t_still, guess, first_period, sign, mode, integrator)
+        guess, first_period, mode = lax.stop_gradient(base)
         normal = ravel(model.flow(t_still, guess, at_start(model, t_still, guess, mode)))
     unravel = jfu.ravel_pytree(guess)[1]
     unknown, residual = shooting.equations(guess, first_period, mode, normal)
@@ -106,7 +105,7 @@ def _shoot(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scalar
         # Where Newton's method ends near an equilibrium, its Jacobian is singular and it seldom says that it converged.
         last = ravel(model.flow(t0, unravel(x), at_start(model, t0, unravel(x), mode)))
         at_rest = jnp.sqrt(normal @ normal) * first_period <= 1e-9 * (1 + jnp.max(jnp.abs(unknown[0])))
-        at_rest = at_rest | (jnp.max(jnp.abs(last)) * first_period <= 1e-6 * size)
+        at_rest |= jnp.max(jnp.abs(last)) * first_period <= 1e-6 * size
         result = RESULTS.where(at_rest, RESULTS.orbit_is_equilibrium, result)
     grazes = (sol.result == RESULTS.tangential_event) & (result == RESULTS.successful)
     result = RESULTS.where(grazes, RESULTS.tangential_event, result)

@@ -82,11 +82,9 @@ def perturbation_tube(
 
     times, which = _times(pieces, (x, y), extent, samples)
     ts = np.array([float(orbit.t0), *times, float(orbit.t0 + orbit.period)])
-    by = orbit.integrator
-    phi = fundamental_matrix(
-        orbit.system, ts[0], ts[-1], orbit.y0, ts=ts, mode=tuple(orbit.mode) or None, solver=by.solver,
-        stepsize_controller=by.stepsize_controller, max_steps=by.max_steps, max_events=by.max_events,
-    )  # fmt: skip
+    how: dict[str, Any] = orbit.integrator._asdict()
+    del how["adjoint"]
+    phi = fundamental_matrix(orbit.system, ts[0], ts[-1], orbit.y0, ts=ts, mode=tuple(orbit.mode) or None, **how)
     plane = [names.index(x), names.index(y)]
     angle = np.linspace(0, 2 * np.pi, CORNERS + 1)
     circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)

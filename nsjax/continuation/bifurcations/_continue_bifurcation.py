@@ -13,13 +13,13 @@ from ...orbits.segments._equations import OrbitCurve
 from ...system._parameter import get_parameter, parameter_path
 from ...system._system import System
 from ..equilibria._branch import CLOSED
-from ..orbits._bifurcation import OrbitBifurcation
+from ..orbits._bifurcation import OrbitBifurcation, Origin
 from ..orbits._record import states_of
 from ..orbits._test_functions import CORNERS, Test
 from ..orbits._tracer import midpoint, OrbitPoint
 from ..orbits.corners._corner import is_impact
 from ._branch_points import BranchLocus
-from ._surface import BifurcationTracer, CUSP, lifted, RESONANCES, surfaces_of, touches
+from ._surface import BifurcationTracer, CUSP, lifted, Place, RESONANCES, surfaces_of, touches
 from ._tracer import Codim2Point, FAILED, LAST, trace, Trail
 
 
@@ -148,47 +148,9 @@ def continue_bifurcation(
     special point that was loaded from a file (the way to it is not stored: find the branch again), that is not known
     as the zero of an equation ("end"), or that does not lie on a curve.
     """
-    origin = special.origin
-    if origin is None:
-        raise ValueError(
-            "Argument `special` must come from `continue_orbit` itself, but was loaded from a file, which does not "
-            "hold the equations that were solved: call `continue_orbit` again, for a short interval."
-        )
-    if origin.test.kind == "guard":
-        raise ValueError(
-            f"Argument `special` must be a zero of an equation, but of this {special.name} at {special.parameter} = "
-            f"{special.value:.10g} only the neighbourhood is known."
-        )
-    curve = origin.curve
-    system = curve.model.system
-    path = parameter_path(system, parameter)
-    if path == curve.path:
-        raise ValueError(f"Argument `parameter` must be another one than that of the branch, `{parameter}`.")
-    if first is None:
-        first = float(curve.low), float(curve.low + curve.width)
-    for name, one, value in (
-        ("interval", interval, float(get_parameter(system, path))),
-        ("first", first, special.value),
-    ):
-        if not one[0] < one[1] or not one[0] <= value <= one[1]:
-            raise ValueError(
-                f"Argument `{name}` must be (low, high) and hold {value:.6g}, the value at the special point, but is "
-                f"({one[0]:.6g}, {one[1]:.6g})."
-            )
-    low, high = (np.array([first[i], interval[i]], float) for i in (0, 1))
+    origin, path, low, high = _checked(special, parameter, interval, first)
     surface, spot, test = lifted(origin, path, low, high)
-    kind_of_locus = BranchLocus if test.kind == "branch" else BifurcationTracer
-    locus = kind_of_locus(surface, test, float(spot.look.branch[1]))
-    try:
-        place = locus.place(spot)
-        place = locus.place(locus.step(place, 0.0), place.along, place.heading)
-        near = [locus.place(locus.step(place, s), place.along, place.heading) for s in (1e-3, -1e-3)]
-    except FAILED as why:
-        raise ValueError(
-            f"Argument `special` must lie on a curve of such points in {special.parameter} and {parameter}, but beside "
-            f"this {special.name} none was found: {why}."
-        ) from why
-    locus = locus.heard([place, *near])
+    locus, place = _locus(special, parameter, surface, spot, test)
     ahead = trace(locus, place, max_step, max_points)
     back = Trail([place.spot]) if ahead.closed else trace(locus, place.turned, max_step, max_points)
     names = (special.parameter, parameter)
@@ -218,7 +180,7 @@ def continue_bifurcation(
         )
 
     return BifurcationCurve(
-        system=system,
+        system=surface.model.system,
         kind=kind,
         surfaces=surfaces,
         parameters=names,
@@ -231,6 +193,59 @@ def continue_bifurcation(
         indices=tuple(i for i, _ in known),
         ends=(ends[0], ends[1]),
     )
+
+
+def _checked(
+    special: OrbitBifurcation, parameter: str, interval: tuple[float, float], first: tuple[float, float] | None
+) -> tuple[Origin, tuple[str, ...], np.ndarray, np.ndarray]:
+    """Where the curve sets out, the second parameter, and the ends of both intervals."""
+    origin = special.origin
+    if origin is None:
+        raise ValueError(
+            "Argument `special` must come from `continue_orbit` itself, but was loaded from a file, which does not "
+            "hold the equations that were solved: call `continue_orbit` again, for a short interval."
+        )
+    if origin.test.kind == "guard":
+        raise ValueError(
+            f"Argument `special` must be a zero of an equation, but of this {special.name} at {special.parameter} = "
+            f"{special.value:.10g} only the neighbourhood is known."
+        )
+    curve = origin.curve
+    system = curve.model.system
+    path = parameter_path(system, parameter)
+    if path == curve.path:
+        raise ValueError(f"Argument `parameter` must be another one than that of the branch, `{parameter}`.")
+    if first is None:
+        first = float(curve.low), float(curve.low + curve.width)
+    for name, one, value in (
+        ("interval", interval, float(get_parameter(system, path))),
+        ("first", first, special.value),
+    ):
+        if not one[0] < one[1] or not one[0] <= value <= one[1]:
+            raise ValueError(
+                f"Argument `{name}` must be (low, high) and hold {value:.6g}, the value at the special point, but is "
+                f"({one[0]:.6g}, {one[1]:.6g})."
+            )
+    low, high = (np.array([first[i], interval[i]], float) for i in (0, 1))
+    return origin, path, low, high
+
+
+def _locus(
+    special: OrbitBifurcation, parameter: str, surface: OrbitCurve, spot: OrbitPoint, test: Test
+) -> tuple[BifurcationTracer | BranchLocus, Place]:
+    """The tracer of the curve, and its place at the special point, with a look at both sides of it."""
+    kind_of_locus = BranchLocus if test.kind == "branch" else BifurcationTracer
+    locus = kind_of_locus(surface, test, float(spot.look.branch[1]))
+    try:
+        place = locus.place(spot)
+        place = locus.place(locus.step(place, 0.0), place.along, place.heading)
+        near = [locus.place(locus.step(place, s), place.along, place.heading) for s in (1e-3, -1e-3)]
+    except FAILED as why:
+        raise ValueError(
+            f"Argument `special` must lie on a curve of such points in {special.parameter} and {parameter}, but beside "
+            f"this {special.name} none was found: {why}."
+        ) from why
+    return locus.heard([place, *near]), place
 
 
 def _kind(curve: OrbitCurve, spot: OrbitPoint, special: OrbitBifurcation, test: Test) -> tuple[str, tuple[str, ...]]:

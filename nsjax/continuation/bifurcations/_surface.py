@@ -14,7 +14,7 @@ from jaxtyping import Array
 from ...derivatives._floquet import trivial
 from ...orbits.segments._equations import linearised, OrbitCurve
 from ...orbits.segments._itinerary import capacity_for, Course, EVENT, GRAZING, Start
-from ...orbits.segments._point import advance, along_segment, PointData, zeros_at_begin
+from ...orbits.segments._point import along_segment, correct, Plane, PointData, zeros_at_begin
 from ...system._parameter import get_parameter
 from ..orbits._bifurcation import Origin
 from ..orbits._test_functions import branch_value, CIRCLE, CORNERS, Test
@@ -62,8 +62,8 @@ def lifted(
     tangent = np.append(spot.look.tangent[:-1], [spot.look.tangent[-1] * float(curve.width) / (high - low)[0], 0.0])
     # The tangent plane is spanned by that of the branch, and by a direction in which the other parameter moves.
     border = np.stack([tangent / np.linalg.norm(tangent), np.eye(len(u))[-1]])
-    newton = np.asarray(test.kind != "branch")  # where the equations are singular it is as exact as it gets
-    found = advance(surface, spot.course, u, border, np.zeros(2), u, newton)
+    newton = test.kind != "branch"  # where the equations are singular it is as exact as it gets
+    found = correct(surface, spot.course, Plane(u, border), newton=newton)
     return surface, spot_of(surface, found, spot.course), test
 
 
@@ -90,7 +90,7 @@ def untouched(origin: Origin) -> Origin:
     start = Start(shorter, look.begin[kept], look.end[kept], xs[kept])
     u = curve.pack(start, spot.parameter)
     border = np.linalg.svd(np.asarray(linearised(curve, shorter, u)))[2][-1]
-    found = advance(curve, shorter, u, border, np.zeros(()), u, np.asarray(True))
+    found = correct(curve, shorter, Plane(u, border))
     if not bool(found.good):
         return origin
     row = kept.index((test.row - 1) % n)
@@ -140,9 +140,7 @@ class BifurcationTracer(AbstractBifurcationTracer):
 
     def at(self, spot: OrbitPoint, s: np.ndarray, guess: np.ndarray | None = None) -> OrbitPoint:
         """The point of the surface at these distances along the frame of the tangent plane at another."""
-        look = spot.look
-        start = look.u + s @ look.tangent if guess is None else guess
-        found = advance(self.curve, spot.course, look.u, look.tangent, s, start, np.asarray(True))
+        found = correct(self.curve, spot.course, Plane(spot.look.u, spot.look.tangent, s), guess)
         if not bool(found.good):
             raise ArithmeticError("there is no orbit")
         return spot_of(self.curve, found, spot.course)
@@ -215,7 +213,7 @@ def cleared(curve: OrbitCurve, spot: OrbitPoint) -> OrbitPoint:
     cuts = np.flatnonzero(course.ends[:n] == GRAZING).tolist()
     if not cuts:
         return spot
-    zeros = np.asarray(zeros_at_begin(curve, curve.model, course))
+    zeros = np.asarray(zeros_at_begin(curve, course))
     least, where, spots = np.array(look.least), np.array(look.where), np.array(look.spots)
     for cut in cuts:
         slot = int(course.slot[cut])
@@ -236,12 +234,11 @@ def _guards_along(
 ) -> tuple[Array, Array, Array]:
     """The least values of the guards along a segment, divided by zeros of these orders at its ends; where; and the
     states there."""
-    model, n = curve.model.with_parameter(curve.path, look.parameter), len(curve.sizes)
+    n = len(curve.sizes)
     orders = jnp.concatenate([jnp.zeros((2, 2 * n), orders.dtype), orders], axis=1)
-    a, b, x = (jnp.asarray(column)[row] for column in (look.begin, look.end, look.x))
-    mode, part = jnp.asarray(course.mode)[row], jnp.asarray(course.part)[row]
-    value = jnp.asarray(look.parameter)
-    found = along_segment(curve, model, value, a, b, x, mode, part, orders, turns=False)
+    columns = (look.begin, look.end, look.x, course.mode, course.part)
+    segment = tuple(jnp.asarray(column)[row] for column in columns)
+    found = along_segment(curve, jnp.asarray(look.parameter), segment, orders, turns=False)
     return found.least[2 * n :], found.share[2 * n :], found.x[2 * n :]
 
 
@@ -268,5 +265,5 @@ def surfaces_of(curve: OrbitCurve, spot: OrbitPoint, test: Test) -> tuple[str, .
 
 def seen_at(curve: OrbitCurve, course: Course, u: np.ndarray, border: np.ndarray) -> OrbitPoint:
     """What is seen of a point that is known to be one of the surface."""
-    found = advance(curve, course, u, border, np.zeros(len(border)), u, np.asarray(False))
+    found = correct(curve, course, Plane(u, border), newton=False)
     return spot_of(curve, jax.device_get(found), course)

@@ -10,7 +10,7 @@ import numpy as np
 from ...setvalued._eigenvalue_crossings import eigenvalue_crossings
 from ...setvalued._pencil import EigenvalueCrossing
 from ._bifurcation import Bifurcation, classified, counted, HalfBranch, odd_one, unstable_number
-from ._corrector import advance, branching, kept, linearised, near, row_sizes, Step
+from ._corrector import branching, kept, linearised, near, row_sizes, Step, step_along
 from ._equations import EquilibriumCurve, first_lyapunov_coefficient
 
 
@@ -95,7 +95,7 @@ def _half(
     if np.any(matters & (signs * here < -ACTIVE)):
         return None
     mode_array, direction = jnp.asarray(mode), jnp.asarray(tangent)
-    step = advance(curve, u, direction, jnp.asarray(length), mode_array)
+    step = step_along(curve, u, direction, jnp.asarray(length), mode_array)
     if not step.good:
         return None
     if abs(float(step.u[-1] - u[-1])) <= CONTINUUM and length < 1e-2:
@@ -155,7 +155,7 @@ def node_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, arrivi
     first = _partners(halves)
     met = tuple(k for k in surfaces if k in left) if halves else tuple(surfaces)
     smooth = () if all(half.regular for half in halves) else ("branch point",)
-    bifurcation = _described(curve, name, u, halves, first, met, continuous, smooth)
+    bifurcation = _described(curve, name, u, halves, first, surfaces=met, continuous=continuous, smooth=smooth)
     if degenerate and not met:
         bifurcation = bifurcation._replace(kind="degenerate branch point", evidence="crossing")
     return Node(u, halves, bifurcation)
@@ -215,6 +215,7 @@ def _described(
     u: Any,
     halves: list[Half],
     first: tuple[Half, Half] | None,
+    *,
     surfaces: tuple[str, ...] = (),
     continuous: bool = True,
     smooth: tuple[str, ...] = (),

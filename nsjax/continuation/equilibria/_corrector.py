@@ -116,7 +116,7 @@ def _corrected(curve: Curve, origin: Array, tangent: Array, s: Array, guess: Arr
 
 
 @eqx.filter_jit
-def advance(curve: Curve, u: Array, tangent: Array, s: Array, mode: Array) -> Step:
+def step_along(curve: Curve, u: Array, tangent: Array, s: Array, mode: Array) -> Step:
     """One step of length `s` along the curve."""
     end, good = _corrected(curve, u, tangent, s, u + s * tangent, mode)
     ahead, scale = _tangent(curve, end, tangent, mode), _scale(curve, u, tangent, mode)
@@ -137,7 +137,7 @@ class Place(NamedTuple):
 
 @eqx.filter_jit
 def locate(
-    curve: Curve, step: Step, origin: Array, tangent: Array, ends: Array, mode: Array, which: Array, slope: Array
+    curve: Curve, step: Step, origin: Array, tangent: Array, ends: Array, mode: Array, which: Array, *, slope: Array
 ) -> Place:
     """Where between the distances `ends` along `tangent` a test function, or its derivative, is zero: by bisection,
     which needs no derivative of it, on the curve, whose equations are regular there."""

@@ -10,7 +10,6 @@ from ._bifurcation import unstable_number
 from ._branch import CLOSED, Strand
 from ._corner import active, fold_at, hopf_at
 from ._corrector import (
-    advance,
     BRANCH,
     branch_point,
     FOLD,
@@ -24,6 +23,7 @@ from ._corrector import (
     PAIR,
     Place,
     Step,
+    step_along,
 )
 from ._equations import EITHER, EquilibriumCurve, Record
 
@@ -64,7 +64,7 @@ class Tracer:
         to the end of the branch, of which `strand.end` then tells."""
         length, traced = FIRST, jnp.asarray(mode)
         while len(strand.records) < self.max_points:
-            step = advance(self.curve, u, tangent, jnp.asarray(length), traced)
+            step = step_along(self.curve, u, tangent, jnp.asarray(length), traced)
             turn = float(np.arccos(np.clip(float(tangent @ step.tangent), -1, 1))) if step.good else np.inf
             zeros = self.zeros(step, u, tangent, mode, length) if step.good else None
             if turn > 0.5 and zeros is not None:
@@ -153,7 +153,7 @@ class Tracer:
 
         def located(ends: tuple[float, float], which: int, slope: bool = False) -> Zero:
             number, flag = jnp.asarray(which), jnp.asarray(slope)
-            place = locate(self.curve, step, u, tangent, jnp.asarray(ends), jnp.asarray(mode), number, flag)
+            place = locate(self.curve, step, u, tangent, jnp.asarray(ends), jnp.asarray(mode), number, slope=flag)
             return Zero(float(place.s), which, place)
 
         for i in map(int, np.flatnonzero(signs)):

@@ -155,6 +155,32 @@ class OrbitBifurcation(NamedTuple):
         )  # fmt: skip
 
     @classmethod
+    def corner(
+        cls, name: str, spot: Any, curve: Any, halves: Sequence[OrbitHalf], by_count: CornerKind,
+        crossings: Sequence[EigenvalueCrossing] | None, *, surfaces: tuple[str, ...],
+        monodromies: tuple[np.ndarray, np.ndarray], multipliers: tuple[np.ndarray, np.ndarray], transition: str | None,
+    ) -> "OrbitBifurcation":  # fmt: skip
+        """A corner, by the number of orbits on each side, and by the crossings of the unit circle (Conjecture 6.2)."""
+        names = {"+1": "fold", "-1": "flip", "pair": "Neimark-Sacker"}
+        by_crossing = None if crossings is None else tuple(names[c.kind] for c in crossings)
+        kind, evidence = by_count.kind, "count"
+        if by_crossing is not None:
+            expected = {
+                "none": [], "fold": ["fold"], "flip": ["flip"], "fold-flip": ["flip", "fold"],
+                "symmetry breaking": ["fold"], "transcritical": ["fold"],
+            }.get(kind)  # fmt: skip
+            evidence = "both" if expected == sorted(by_crossing) else "count"
+            pairs = [k for k in by_crossing if k not in ("fold", "flip")]
+            if kind == "none" and pairs:
+                kind, evidence = pairs[0], "crossing"
+        return cls(
+            kind=kind, discontinuous=True, criticality=by_count.criticality, evidence=evidence, by_count=by_count.kind,
+            by_crossing=by_crossing, transition=transition,
+            count=(by_count.below, by_count.above), surfaces=surfaces, crossings=crossings or [], halves=halves,
+            multipliers=multipliers, monodromies=monodromies, **_common(name, spot, curve),
+        )  # fmt: skip
+
+    @classmethod
     def repelled(
         cls, name: str, spot: Any, curve: Any, halves: Sequence[OrbitHalf], surfaces: tuple[str, ...]
     ) -> "OrbitBifurcation":
@@ -199,36 +225,3 @@ def _criticality(spot: Any, born: OrbitHalf) -> str:
     unstable = int(np.sum(np.abs(born.multipliers) > 1 + 1e-9))
     at = int(np.sum(np.abs(spot.multipliers) > 1 + 1e-6))
     return "supercritical" if unstable <= at else "subcritical"
-
-
-def named(
-    by_count: CornerKind,
-    crossings: Sequence[EigenvalueCrossing] | None,
-    name: str,
-    spot: Any,
-    curve: Any,
-    halves: Sequence[OrbitHalf],
-    surfaces: tuple[str, ...],
-    monodromies: tuple[np.ndarray, np.ndarray],
-    multipliers: tuple[np.ndarray, np.ndarray],
-    transition: str | None,
-) -> OrbitBifurcation:
-    """A corner, by the number of orbits on each side, and by the crossings of the unit circle (Conjecture 6.2)."""
-    names = {"+1": "fold", "-1": "flip", "pair": "Neimark-Sacker"}
-    by_crossing = None if crossings is None else tuple(names[c.kind] for c in crossings)
-    kind, evidence = by_count.kind, "count"
-    if by_crossing is not None:
-        expected = {
-            "none": [], "fold": ["fold"], "flip": ["flip"], "fold-flip": ["flip", "fold"],
-            "symmetry breaking": ["fold"], "transcritical": ["fold"],
-        }.get(kind)  # fmt: skip
-        evidence = "both" if expected == sorted(by_crossing) else "count"
-        pairs = [k for k in by_crossing if k not in ("fold", "flip")]
-        if kind == "none" and pairs:
-            kind, evidence = pairs[0], "crossing"
-    return OrbitBifurcation(
-        kind=kind, discontinuous=True, criticality=by_count.criticality, evidence=evidence, by_count=by_count.kind,
-        by_crossing=by_crossing, transition=transition,
-        count=(by_count.below, by_count.above), surfaces=surfaces, crossings=crossings or [], halves=halves,
-        multipliers=multipliers, monodromies=monodromies, **_common(name, spot, curve),
-    )  # fmt: skip

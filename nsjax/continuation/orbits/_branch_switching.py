@@ -9,7 +9,7 @@ import numpy as np
 from ...maps._corner_normal_form import Cycle
 from ...orbits.segments._equations import linearised, OrbitCurve, state_at
 from ...orbits.segments._itinerary import capacity_for, Course, Start, TIME
-from ...orbits.segments._point import advance
+from ...orbits.segments._point import correct, Plane
 from ._bifurcation import OrbitBifurcation, OrbitHalf
 from ._test_functions import CORNERS
 from ._tracer import alike, midpoint, OrbitPoint, OrbitTracer, spot_of, told_by, turned, Zero
@@ -77,9 +77,7 @@ def _kernel(tracer: OrbitTracer, course: Course, u: Any) -> np.ndarray:
 def set_out(tracer: OrbitTracer, course: Course, u: Any, direction: np.ndarray) -> OrbitPoint | None:
     """An orbit on the branch that leaves `u` in this direction, with its tangent away from it."""
     for step in BRANCHING:
-        look = advance(
-            tracer.curve, course, u, direction, np.asarray(step, np.float64), u + step * direction, np.asarray(True)
-        )
+        look = correct(tracer.curve, course, Plane(u, direction, step))
         if not bool(look.good):
             continue
         spot = spot_of(tracer.curve, look, course)

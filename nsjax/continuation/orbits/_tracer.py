@@ -10,7 +10,7 @@ import numpy as np
 from ..._numerics._bracket import bracketed
 from ...orbits.segments._equations import OrbitCurve, state_at
 from ...orbits.segments._itinerary import Course
-from ...orbits.segments._point import advance, PointData
+from ...orbits.segments._point import correct, Plane, PointData
 from ._test_functions import (
     BRANCH,
     branch_value,
@@ -142,11 +142,7 @@ class OrbitTracer:
 
     def at(self, spot: OrbitPoint, s: float, guess: Any = None) -> OrbitPoint | None:
         """The point at the distance `s` along the tangent of another."""
-        look = spot.look
-        guess = look.u + s * look.tangent if guess is None else guess
-        found = advance(
-            self.curve, spot.course, look.u, look.tangent, np.asarray(s, np.float64), guess, np.asarray(True)
-        )
+        found = correct(self.curve, spot.course, Plane(spot.look.u, spot.look.tangent, s), guess)
         return spot_of(self.curve, found, spot.course) if bool(found.good) else None
 
     def between(self, a: OrbitPoint, b: OrbitPoint, value: float) -> OrbitPoint | None:
@@ -165,7 +161,7 @@ class OrbitTracer:
     def corrected(self, course: Course, guess: Any, border: Any = None) -> OrbitPoint | None:
         """The orbit in a course next to a guess, at the same parameter (or on another plane)."""
         border = np.eye(len(guess))[-1] if border is None else border
-        found = advance(self.curve, course, guess, border, np.zeros(()), guess, np.asarray(True))
+        found = correct(self.curve, course, Plane(guess, border))
         return spot_of(self.curve, found, course) if bool(found.good) else None
 
     def further(self, arc: Arc) -> Arc:
@@ -219,25 +215,7 @@ class OrbitTracer:
         """The zeros of test functions between two points, in their order, up to the first at which the course ends;
         None if the step must be shorter for them to be told."""
         scale = float(spot.look.branch[1])
-        before, after = (told_by(self.curve, p, scale) for p in (spot, step))
-        changed, found, lost = [], [], []
-        for test, value in before.items():
-            if test not in after or after[test] == 0:
-                continue
-            if test.kind in CORNERS and abs(value) < ON < -after[test] and not self.virtual:
-                found.append(Zero(0.0, test, spot))
-                continue
-            if value * after[test] > 0:
-                continue
-            if self.virtual and test.kind not in ("low", "high"):
-                continue
-            if test.kind in (*CORNERS, "low", "high") and after[test] > 0:
-                continue  # it comes from where it could not be: a start on the point itself
-            changed.append(test)
-        for test in changed:
-            zero = self.located(spot, step, length, test, scale)
-            found += [] if zero is None else [zero]
-            lost += [test] if zero is None else []
+        found, lost = self.changed(spot, step, length, scale)
         for test in lost:
             # Beside a singular point, which another test function may know.
             small = SINGULAR if test == BRANCH else VANISHES
@@ -251,31 +229,55 @@ class OrbitTracer:
         found.sort(key=lambda zero: zero.s)
         near = NEAR * length + 1e-9
         final = next((z for z in found if z.test.kind not in PASSED), None)
-        if final is not None:
-            # What lies before the end of the course may have changed back beyond it, or at the end itself: it is looked
-            # at a little before that. (At a branch point it may turn.)
-            s, last = self.short_of(spot, final, 2 * near)
-            there = told_by(self.curve, last, scale)
-            for test in (t for t in before if t.kind in PASSED and before[t] * there[t] < 0):
-                if test.kind == "fold" and final.test == BRANCH:
-                    continue
-                if any(z.test == test and z.s <= final.s for z in found):
-                    continue
-                zero = self.located(spot, last, s, test, scale)
-                found += [] if zero is None else [zero]
-            found.sort(key=lambda zero: zero.s)
-        out: list[Zero] = []
-        for zero in found:
-            final = zero.test.kind not in PASSED
-            if final:
-                together = [z for z in found if abs(z.s - zero.s) < near and z is not zero]
-                out.append(self.told(spot, zero, together))
-                break
-            out.append(zero)
-        if out and out[-1].test.kind in (*CORNERS, "branch"):
+        if final is None:
+            return found
+        return self.ended(spot, self.with_those_before(spot, final, found, near, scale), near)
+
+    def changed(self, spot: OrbitPoint, step: OrbitPoint, length: float, scale: float) -> tuple[list[Zero], list[Test]]:
+        """The zeros of the test functions that change their sign between two points, and those whose zero is not to be
+        found."""
+        before, after = (told_by(self.curve, p, scale) for p in (spot, step))
+        found, lost = [], []
+        for test, value in before.items():
+            if test not in after or after[test] == 0:
+                continue
+            if test.kind in CORNERS and abs(value) < ON < -after[test] and not self.virtual:
+                found.append(Zero(0.0, test, spot))
+                continue
+            if value * after[test] > 0 or (self.virtual and test.kind not in ("low", "high")):
+                continue
+            if test.kind in (*CORNERS, "low", "high") and after[test] > 0:
+                continue  # it comes from where it could not be: a start on the point itself
+            zero = self.located(spot, step, length, test, scale)
+            found += [] if zero is None else [zero]
+            lost += [test] if zero is None else []
+        return found, lost
+
+    def with_those_before(
+        self, spot: OrbitPoint, final: Zero, found: list[Zero], near: float, scale: float
+    ) -> list[Zero]:
+        """What lies before the end of the course may have changed back beyond it, or at the end itself: it is looked at
+        a little before that. (At a branch point it may turn.)"""
+        s, last = self.short_of(spot, final, 2 * near)
+        before, there = (told_by(self.curve, p, scale) for p in (spot, last))
+        for test in (t for t in before if t.kind in PASSED and before[t] * there[t] < 0):
+            if test.kind == "fold" and final.test == BRANCH:
+                continue
+            if any(z.test == test and z.s <= final.s for z in found):
+                continue
+            zero = self.located(spot, last, s, test, scale)
+            found = found if zero is None else [*found, zero]
+        return sorted(found, key=lambda zero: zero.s)
+
+    def ended(self, spot: OrbitPoint, found: list[Zero], near: float) -> list[Zero]:
+        """The zeros up to the first at which the course ends, with all that vanishes there."""
+        end = next(i for i, zero in enumerate(found) if zero.test.kind not in PASSED)
+        last = self.told(spot, found[end], [z for z in found if abs(z.s - found[end].s) < near and z is not found[end]])
+        out = found[:end]
+        if last.test.kind in (*CORNERS, "branch"):
             # A test function may pass its zero together with the corner's; it is the corner's then.
-            out = [z for z in out[:-1] if out[-1].s - z.s > near] + out[-1:]
-        return out
+            out = [z for z in out if last.s - z.s > near]
+        return [*out, last]
 
     def short_of(self, spot: OrbitPoint, zero: Zero, off: float) -> tuple[float, OrbitPoint]:
         """The point so far before a zero on the way from another point; if there is none, the zero."""
@@ -344,7 +346,7 @@ class OrbitTracer:
         root = min(real, key=abs)
         weights = np.linalg.solve(powers.T, root ** np.arange(len(nodes)))
         u = weights @ np.stack([here.look.u for here in spots])
-        found = advance(self.curve, spot.course, u, spot.look.tangent, np.zeros(()), u, np.asarray(False))
+        found = correct(self.curve, spot.course, Plane(u, spot.look.tangent), newton=False)
         return s + 0.5 * length * root, spot_of(self.curve, found, spot.course)
 
 

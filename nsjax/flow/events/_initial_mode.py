@@ -25,93 +25,133 @@ def start_mode(
 ) -> tuple[ModeState, Bool[Array, ""], RESULTS]:
     """The mode in which the solution sets out: from the signs of h, from `mode=`, and on a surface by the fields; and
     whether another solution sets out there too. `horizon`: for how long it is to be solved."""
-    modes, parts, roots, at, chosen = [], [], [], {}, []
-    result = RESULTS.successful
-    on, beyond = {}, {}
+    start = _Start(model, t, y, given, horizon)
     counts = model.counts(t)
     for k, switch in enumerate(model.switches):
-        zero = jnp.zeros((), jnp.int32)
         if k in counts:  # whatever `mode` says: it may be that of the same phase a period earlier
-            modes.append(counts[k])
-            parts.append(None)
-            roots.append(zero)
-            continue
-        if isinstance(switch, relay):
+            start.put(counts[k])
+        elif isinstance(switch, relay):
             before = jnp.asarray(given.get(switch.name, 0), jnp.int32)
-            modes.append(switch.mode_at(model.system, model.time(t), y, before))
-            parts.append(None)
-            roots.append(zero)
-            continue
-        h = jnp.stack(model.h(k, t, y))
-        noise = model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y)
-        part = jnp.argmin(h)
-        h, noise = h[part], noise[part]
-        on[k] = jnp.abs(h) <= noise
-        parts.append(part.astype(jnp.int32) if model.parts[k] > 1 else None)
-        roots.append(zero)
-        if isinstance(switch, impact):
-            rests = jnp.zeros((), bool)
-            if switch.name not in given:
-                result = RESULTS.where(h < -noise, RESULTS.start_penetrates, result)
-            else:
-                if k not in model.contacts:
-                    raise ValueError(
-                        f"Argument `mode` must not name `{switch.name}`: this impact surface cannot hold the solution "
-                        f"(it is a minimum, or `s.{switch.name}` is not a force that acts on d²h/dt²)."
-                    )
-                at[k], rests = rests, jnp.asarray(given[switch.name]) == 1
-                result = RESULTS.where(rests & (h > 1e6 * noise), RESULTS.wrong_mode, result)
-                beyond[k] = -h - 1e6 * noise
-                on[k] = h <= noise
-            if switch.name not in given and k in model.contacts:
-                still = ModeState((), tuple(parts), ())
-                (slow,) = model.rounding(lambda t, y, k=k, still=still: (model.level(k, t, y, still),), t, y)
-                at[k] = rests = on[k] & (jnp.abs(model.level(k, t, y, still)) <= slow)
-            modes.append(rests.astype(jnp.int32))
-        elif switch.name in given:
-            mode = jnp.asarray(given[switch.name], jnp.int32)
-            # A state taken from an earlier solution may carry some drift off its surface.
-            beyond[k] = jnp.where(mode == 0, jnp.abs(h), -mode.astype(h.dtype) * h) - 1e6 * noise
-            modes.append(mode)
-            chosen.append(k)
-            at[k] = on[k] = mode.astype(h.dtype) * h <= noise
+            start.put(switch.mode_at(model.system, model.time(t), y, before))
+        elif isinstance(switch, impact):
+            start.put_contact(k)
         else:
-            modes.append(jnp.where(on[k], 0, jnp.sign(h)).astype(jnp.int32))
-            at[k] = on[k]
-    state = ModeState(tuple(modes), tuple(parts), tuple(roots))
-    for k, switch in enumerate(model.switches):
-        if isinstance(switch, sgn) and switch.name not in given:
-            # Nearer than an event can be told from the start: the end of a period on a surface is off by rounding.
-            instant = 2 * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + horizon)
-            h = jnp.min(jnp.stack(model.h(k, t, y)))
-            on[k] = at[k] = on[k] | (jnp.abs(h) <= instant * jnp.abs(frozen(model.approach(k, t, y, state))))
-            modes[k] = jnp.where(on[k], 0, modes[k])
-    state = state._replace(mode=tuple(modes))
-    for k, gap in beyond.items():
-        # Near zero the rounding of h itself is nothing beside that of the terms which once led there.
-        soon = AT_ONCE * float(jnp.finfo(t.dtype).eps) ** 0.5 * horizon
-        off = gap > soon * jnp.abs(frozen(model.approach(k, t, y, state)))
-        failure = RESULTS.start_penetrates if isinstance(model.switches[k], impact) else RESULTS.wrong_mode
-        result = RESULTS.where(off, failure, result)
+            start.put_sign(k)
+    start.join_surfaces_at_once()
+    start.refuse_wrong_modes()
+    at = start.at
     leaves = {k: jnp.zeros((), jnp.int32) for k in at}
-    state, unsure, forked, wrong = settle(model, t, y, state, at, leaves, tuple(chosen))
-    for k in model.holdable:  # see `land`
+    state, unsure, forked, wrong = settle(model, t, y, start.state(), at, leaves, tuple(start.chosen))
+    for k in model.holdable:  # run backwards, see `transition`
         forked = forked | (model.held(k, state.mode[k]) & (model.direction < 0))
-    result = RESULTS.where(unsure, RESULTS.repulsive_sliding, result)
+    result = RESULTS.where(unsure, RESULTS.repulsive_sliding, start.result)
     result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
-    # Guards of surfaces on which the start lies have a root there already.
-    roots = list(state.roots)
-    f = model.flow(t, y, state)
-    for k, value in enumerate(frozen(model.values(t, y, state))):
-        if model.static(k) and k in model.holdable:
-            edge = jnp.where(model.direction < 0, model.edge(k, value, nearly(t)), 0)
-            roots[k] = jnp.where((state.mode[k] == 0) & ((k in chosen) | ~at[k]), edge, roots[k])
-    for k, here in on.items():
-        rate = model.approach(k, t, y, state)
-        sign = 1 - state.mode[k] if isinstance(model.switches[k], impact) else state.mode[k]
-        part = 0 if state.part[k] is None else state.part[k]
-        size = model.sizes(lambda t, y, k=k: model.h(k, t, y), t, y, jnp.ones_like(t), f)[part]
-        fresh = jnp.where(jnp.abs(rate) > jnp.sqrt(jnp.finfo(t.dtype).eps) * size, 1, 2)
-        settled = jnp.zeros((), bool) if k in chosen else at.get(k, jnp.zeros((), bool))
-        roots[k] = jnp.where(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
-    return state._replace(roots=tuple(roots)), forked, result
+    return state._replace(roots=tuple(start.roots_there(state))), forked, result
+
+
+class _Start:
+    """The mode in which a solution sets out while it is found out, switch by switch."""
+
+    def __init__(self, model: SwitchedSystem, t: Scalar, y: Y, given: dict[str, Any], horizon: Scalar):
+        self.model, self.t, self.y, self.given, self.horizon = model, t, y, given, horizon
+        self.modes: list[Any] = []
+        self.parts: list[Any] = []
+        self.chosen: list[int] = []  # switches whose mode is given
+        self.at: dict[int, Bool[Array, ""]] = {}  # as for `settle`
+        self.on: dict[int, Bool[Array, ""]] = {}  # whether h is zero
+        self.beyond: dict[int, Scalar] = {}  # how far the state is off the place where the given mode is
+        self.result = RESULTS.successful
+
+    def put(self, mode: Any, part: Any = None) -> None:
+        self.modes.append(mode)
+        self.parts.append(part)
+
+    def state(self) -> ModeState:
+        return ModeState.of(self.modes, self.parts)
+
+    def surface(self, k: int) -> tuple[Scalar, Scalar, Any]:
+        """The active component of h, its rounding, and which it is."""
+        model, t, y = self.model, self.t, self.y
+        h = jnp.stack(model.h(k, t, y))
+        noise = model.rounding(lambda t, y: model.h(k, t, y), t, y)
+        part = jnp.argmin(h)
+        return h[part], noise[part], part.astype(jnp.int32) if model.parts[k] > 1 else None
+
+    def put_contact(self, k: int) -> None:
+        """A contact is at rest if that is given, or if neither gap nor velocity is more than rounding."""
+        model, t, y, name = self.model, self.t, self.y, self.model.switches[k].name
+        h, noise, part = self.surface(k)
+        self.on[k], rests = jnp.abs(h) <= noise, jnp.zeros((), bool)
+        if name in self.given:
+            if k not in model.contacts:
+                raise ValueError(
+                    f"Argument `mode` must not name `{name}`: this impact surface cannot hold the solution (it is a "
+                    f"minimum, or `s.{name}` is not a force that acts on d²h/dt²)."
+                )
+            self.at[k], rests = rests, jnp.asarray(self.given[name]) == 1
+            self.result = RESULTS.where(rests & (h > 1e6 * noise), RESULTS.wrong_mode, self.result)
+            self.beyond[k] = -h - 1e6 * noise
+            self.on[k] = h <= noise
+        else:
+            self.result = RESULTS.where(h < -noise, RESULTS.start_penetrates, self.result)
+            if k in model.contacts:
+                still = ModeState((), (*self.parts, part), ())
+                (slow,) = model.rounding(lambda t, y: (model.level(k, t, y, still),), t, y)
+                self.at[k] = rests = self.on[k] & (jnp.abs(model.level(k, t, y, still)) <= slow)
+        self.put(rests.astype(jnp.int32), part)
+
+    def put_sign(self, k: int) -> None:
+        """A `sgn` switch has the sign of h, 0 on its surface, or what is given."""
+        name = self.model.switches[k].name
+        h, noise, part = self.surface(k)
+        self.on[k] = jnp.abs(h) <= noise
+        if name in self.given:
+            mode = jnp.asarray(self.given[name], jnp.int32)
+            # A state taken from an earlier solution may carry some drift off its surface.
+            self.beyond[k] = jnp.where(mode == 0, jnp.abs(h), -mode.astype(h.dtype) * h) - 1e6 * noise
+            self.chosen.append(k)
+            self.on[k] = mode.astype(h.dtype) * h <= noise
+        else:
+            mode = jnp.where(self.on[k], 0, jnp.sign(h)).astype(jnp.int32)
+        self.at[k] = self.on[k]
+        self.put(mode, part)
+
+    def join_surfaces_at_once(self) -> None:
+        """Nearer to a surface than an event can be told from the start is on it: the end of a period there is off by
+        rounding."""
+        model, t, y, state = self.model, self.t, self.y, self.state()
+        for k in model.of_kind(sgn):
+            if k not in self.chosen:
+                instant = 2 * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + self.horizon)
+                h = jnp.min(jnp.stack(model.h(k, t, y)))
+                near = jnp.abs(h) <= instant * jnp.abs(frozen(model.approach(k, t, y, state)))
+                self.on[k] = self.at[k] = self.on[k] | near
+                self.modes[k] = jnp.where(self.on[k], 0, self.modes[k])
+
+    def refuse_wrong_modes(self) -> None:
+        model, t, y, state = self.model, self.t, self.y, self.state()
+        for k, gap in self.beyond.items():
+            # Near zero the rounding of h itself is nothing beside that of the terms which once led there.
+            soon = AT_ONCE * float(jnp.finfo(t.dtype).eps) ** 0.5 * self.horizon
+            off = gap > soon * jnp.abs(frozen(model.approach(k, t, y, state)))
+            contact = isinstance(model.switches[k], impact)
+            failure = RESULTS.start_penetrates if contact else RESULTS.wrong_mode
+            self.result = RESULTS.where(off, failure, self.result)
+
+    def roots_there(self, state: ModeState) -> list[Any]:
+        """Guards of surfaces on which the start lies have a root there already."""
+        model, t, y, roots = self.model, self.t, self.y, list(state.roots)
+        f = model.flow(t, y, state)
+        for k, value in enumerate(frozen(model.values(t, y, state))):
+            if model.static(k) and k in model.holdable:
+                edge = jnp.where(model.direction < 0, model.edge(k, value, nearly(t)), 0)
+                roots[k] = jnp.where((state.mode[k] == 0) & ((k in self.chosen) | ~self.at[k]), edge, roots[k])
+        for k, here in self.on.items():
+            rate = model.approach(k, t, y, state)
+            sign = 1 - state.mode[k] if isinstance(model.switches[k], impact) else state.mode[k]
+            part = 0 if state.part[k] is None else state.part[k]
+            size = model.sizes(lambda t, y, k=k: model.h(k, t, y), t, y, jnp.ones_like(t), f)[part]
+            fresh = jnp.where(jnp.abs(rate) > jnp.sqrt(jnp.finfo(t.dtype).eps) * size, 1, 2)
+            settled = jnp.zeros((), bool) if k in self.chosen else self.at.get(k, jnp.zeros((), bool))
+            roots[k] = jnp.where(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
+        return roots

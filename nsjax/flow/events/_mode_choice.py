@@ -75,12 +75,32 @@ def settle(
     else:
         assert seen is not None
         trial, seen, others, wrong = (_alone if len(which) == 1 else _search)(here, trial, seen, noise)
-    at, leaves, state = here.at, here.leaves, here.state
-    s, rates, slopes, _ = seen
+    _, rates, slopes, _ = seen
     if model.contacts and len(model.holdable) > 1:
         trial = _pinned(here, trial, rates)
-    roots, forked, unsure = list(state.roots), jnp.any(others), false
-    for i, k in enumerate(which):
+    state, unsure = _entered(here, trial, seen, others, noise)
+    forked = jnp.any(others)
+    for k in which if not model.steady else ():
+        if here.dry(k):
+            if here.starts:
+                s = here.values(trial)[1]
+                (blur,) = model.rounding(lambda t, y, k=k, s=s: model.rates((k,), t, y, here.state, s), t, y)
+                several = ~(jnp.maximum(jnp.abs(rates[k]), 2 * jnp.abs(slopes[k])) > blur)  # all fields are tangent
+            else:
+                # What is let go by a surface that has come to repel, beyond a two-fold, might have left it before.
+                several = (here.came[k] == 0) & (here.leaves[k] != 0) & (slopes[k] > 0)
+            forked = forked | (here.at[k] & several)
+    return state, unsure, forked, wrong
+
+
+def _entered(
+    here: Instant, trial: dict[int, Any], seen: Outcome, others: Bool[Array, " m"], noise: dict
+) -> tuple[ModeState, Bool[Array, ""]]:
+    """The chosen mode, with the roots that its guards have at this instant; and whether a side must be chosen."""
+    model, t, leaves = here.model, here.t, here.leaves
+    s, rates, slopes, _ = seen
+    roots, unsure = list(here.state.roots), jnp.zeros((), bool)
+    for i, k in enumerate(here.which):
         if k in model.contacts:
             # It lifts off with h = dh/dt = 0, and where its force has reached zero d²h/dt² = 0 too.
             fresh = jnp.where(leaves[k] != 0, 3, 2)
@@ -97,17 +117,8 @@ def settle(
                 unsure = unsure | (here.open(k) & (trial[k] == 0) & (slopes[k] > 0) & others[i])
         held = model.held(k, trial[k]) if k in model.holdable else False
         roots[k] = jnp.where(here.open(k), jnp.where(held, edge, fresh), roots[k]).astype(jnp.int32)
-    for k in which if not model.steady else ():
-        if here.dry(k):
-            if here.starts:
-                (blur,) = model.rounding(lambda t, y, k=k: model.rates((k,), t, y, state, here.values(trial)[1]), t, y)
-                several = ~(jnp.maximum(jnp.abs(rates[k]), 2 * jnp.abs(slopes[k])) > blur)  # all fields are tangent
-            else:
-                # What is let go by a surface that has come to repel, beyond a two-fold, might have left it before.
-                several = (here.came[k] == 0) & (leaves[k] != 0) & (slopes[k] > 0)
-            forked = forked | (at[k] & several)
-    state = state._replace(mode=tuple(m.astype(jnp.int32) for m in trial.values()), roots=tuple(roots))
-    return state, unsure, forked, wrong
+    mode = tuple(m.astype(jnp.int32) for m in trial.values())
+    return here.state._replace(mode=mode, roots=tuple(roots)), unsure
 
 
 def _together(here: Instant, trial: dict[int, Any]) -> Instant:

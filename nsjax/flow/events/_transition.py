@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..._numerics._bernstein import bend
 from ..._types import Scalar, Y
@@ -72,16 +72,12 @@ def transition(
         if isinstance(switch, impact):
             news = news | event.fired[k]
 
-    slot, part, missed = event.slot, event.part, event.missed
+    slot, part = event.slot, event.part
     cosines, slack = transversality(model, t, event.before, step.state, part, tolerance)
-    cosine = cosines[slot]
+    cosine, missed = cosines[slot], event.missed
     if event.ticks is not None:
         cosine = jnp.where(event.ticks, 1, cosine)
-        # A guard may also jump to just above zero.
-        onto = later.stacked(later.guards(t, after, state), jnp.inf)[:, 0]
-        single = jnp.asarray([not s.holding and model.parts[s.switch] == 1 for s in model.slots])
-        fresh = event.ticks & (onto > 0) & single & (later.stacked(later.known_roots(state), 0)[:, 0] == 0)
-        missed = jnp.where(fresh, jnp.minimum(missed, onto), missed)
+        missed = jnp.minimum(missed, jnp.where(event.ticks, event.jumped_to(state, after), jnp.inf))
     rows = [a[slot, part[slot]] for a in step.polynomials]
     bends = bend(rows, (t - step.t) / jnp.where(halted, 1, step.t_next - step.t)) > 0
     grazes = event.found & news & ~halted & bends & (cosine < jnp.cbrt(jnp.finfo(t.dtype).eps))
@@ -271,3 +267,12 @@ class _Event:
             on_it = jnp.abs(guard(self.t, after)[0]) <= self.later.rounding(guard, self.t, after)[0]
             roots[k] = jnp.where(self.fired[k], on_it.astype(jnp.int32), roots[k])
         return state._replace(roots=tuple(roots))
+
+    def jumped_to(self, state: ModeState, after: Y) -> Float[Array, " slots"]:
+        """The guards after a tick, which may make one of them jump to just above zero; infinite where they do not tell
+        that."""
+        later = self.later
+        onto = later.stacked(later.guards(self.t, after, state), jnp.inf)[:, 0]
+        single = jnp.asarray([not s.holding and later.parts[s.switch] == 1 for s in later.slots])
+        fresh = (onto > 0) & single & (later.stacked(later.known_roots(state), 0)[:, 0] == 0)
+        return jnp.where(fresh, onto, jnp.inf)

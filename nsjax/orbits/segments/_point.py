@@ -14,7 +14,6 @@ from ..._numerics._root import find_root, Newton
 from ..._types import Scalar
 from ...derivatives._floquet import floquet, structural_zeros
 from ...system._model import SwitchedSystem
-from ...system._relay import relay
 from ._equations import OrbitCurve, row_sizes
 from ._itinerary import Course, EVENT, REPELLING_EXIT, TIME
 
@@ -75,40 +74,49 @@ class PointData(NamedTuple):
     residual: Scalar
 
 
-def advance(
-    curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array, newton: Array | bool = True
-) -> PointData:
-    """The point of the curve at the distance `s` from `origin` along `border` (of a surface, at several distances along
-    as many directions), and all that is seen of it; or, without
-    `newton`, of the guess itself."""
+class Plane(NamedTuple):
+    """Where a point of a curve is looked for: at a `distance` from `origin` along `normal`. (Of a surface, at several
+    distances along as many directions.)"""
 
-    return _advance(curve.on(course), course, origin, border, s, guess, np.asarray(newton))
+    origin: Any
+    normal: Any
+    distance: Any = 0.0
+
+    def filled(self) -> "Plane":
+        """The same with one distance for each direction."""
+        shape = np.shape(self.normal)[:-1]
+        return self._replace(distance=np.broadcast_to(np.asarray(self.distance, float), shape))
+
+
+def correct(curve: OrbitCurve, course: Course, plane: Plane, guess: Any = None, newton: bool = True) -> PointData:
+    """The corrector: the point of the curve on a plane, by Newton's method from a `guess` (by
+    default straight ahead), and all that is seen of it; or, without `newton`, of the guess itself."""
+    plane = plane.filled()
+    guess = plane.origin + np.dot(plane.distance, plane.normal) if guess is None else guess
+    return _correct(curve.on(course), course, plane, guess, np.asarray(newton))
 
 
 @eqx.filter_jit
-def _advance(
-    curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array, newton: Array
+def _correct(curve: OrbitCurve, course: Course, plane: Plane, guess: Array, newton: Array) -> PointData:
+    return corrected(curve, course, plane, guess, newton)
+
+
+def corrected(
+    curve: OrbitCurve, course: Course, plane: Plane, guess: Array, newton: Array | bool = True, turns: bool = True
 ) -> PointData:
-    return step_on(curve, course, origin, border, s, guess, newton)
-
-
-def step_on(
-    curve: OrbitCurve, course: Course, origin: Array, border: Array, s: Array, guess: Array,
-    newton: Array | bool = True, turns: bool = True,
-) -> PointData:  # fmt: skip
-    """`advance`, within a program; without `turns` the largest and least states are those at the nodes."""
+    """`correct`, within a program; without `turns` the largest and least states are those at the nodes."""
+    origin, border, distance = plane
 
     def residual(u: Array, _: Any) -> Array:
-        off = jnp.append(curve.residual(u, course, origin)[0], border @ (u - origin) - s)
+        off = jnp.append(curve.residual(u, course, origin)[0], border @ (u - origin) - distance)
         return jnp.where(newton, off, u - guess)
 
     u, good = find_root(residual, guess, None, Newton(TOLERANCE, 10))
-    return look_at(curve, u, border, course, origin, good, turns)
+    return look_at(curve, course, u, good, plane, turns)
 
 
-def look_at(
-    curve: OrbitCurve, u: Array, border: Array, course: Course, origin: Array, good: Array, turns: bool
-) -> PointData:
+def look_at(curve: OrbitCurve, course: Course, u: Array, good: Bool[Array, ""], plane: Plane, turns: bool) -> PointData:
+    origin, border, _ = plane
     begin, end, x, value = curve.parts(u)
     n, rows, m = len(curve.sizes), len(begin), curve.dimension
     model = curve.model.with_parameter(curve.path, value)
@@ -128,7 +136,46 @@ def look_at(
     branch = jnp.stack(jnp.linalg.slogdet(jnp.concatenate([df, along])))
     tangent = along.reshape(jnp.shape(border))
 
-    # Derivatives from segment to segment at the same time: the blocks of DF, the moved times eliminated.
+    factors = _factors(curve, course, u, df, closing)
+    index = jnp.arange(rows, dtype=course.num.dtype)
+    mode = jnp.asarray(course.mode)
+    zeros = structural_zeros(model.system, jnp.where((index < course.num)[:, None], mode, mode[:1]))
+    found = floquet(factors, zeros, curve.autonomous)
+    free = jnp.any((course.ends == REPELLING_EXIT) & (index < course.num))
+    either = zip(_infinitely_unstable(n, curve.autonomous), found)
+    monodromy, multipliers, stable = (jnp.where(free, x, y) for x, y in either)
+
+    # Along the way.
+    inside = (index < course.num)[:, None]
+    along = _along(curve, course, u, turns)
+    least = along.least[:, 2 * n :]
+    low, high = jnp.min(jnp.where(inside, along.least[:, : 2 * n], jnp.inf), axis=0).reshape(2, n)
+    length = jnp.sum(jnp.where(inside[:, 0], end - begin, 0))
+    mean, square = jnp.sum(jnp.where(inside[..., None], along.sums, 0), axis=0) / length
+    period = end[course.num - 1] - begin[0]
+    if not curve.autonomous:
+        period = jnp.asarray(model.system.period, u.dtype) * curve.order.astype(u.dtype)
+    turns_t = begin[:, None] + (end - begin)[:, None] * along.share[:, : 2 * n]
+    rates, values, margins = _at_ends(curve, model, end, last, course)
+    # Beside a branch point rounding moves the root by more than Newton's method is to find it to.
+    wrong = jnp.max(jnp.abs(f))
+    good = (good | (wrong < TOLERANCE)) & jnp.all(jnp.isfinite(tangent))
+    return PointData(
+        u=u, tangent=tangent, good=good, parameter=value, period=period, begin=begin, end=end, x=x, last=last,
+        factors=factors, monodromy=monodromy, multipliers=multipliers, stable=stable, rates=rates, ends=values,
+        margins=margins, least=least, where=along.share[:, 2 * n :], most=along.most[:, 2 * n :],
+        spots=along.x[:, 2 * n :], low=low, high=-high, mean=mean, square=square, ts=along.ts, xs=along.xs,
+        turns_t=turns_t, turns_x=along.x[:, : 2 * n], branch=branch, residual=wrong,
+    )  # fmt: skip
+
+
+def _factors(curve: OrbitCurve, course: Course, u: Array, df: Array, closing: Array) -> Array:
+    """The derivatives from the beginning of each segment to that of the next, at the same time: the blocks of `df`, the
+    Jacobian of the equations, from which the moved times are eliminated. `closing`: the derivative of the time at which
+    the last segment ends."""
+    begin, _, x, value = curve.parts(u)
+    n, rows, m = len(curve.sizes), len(begin), curve.dimension
+    model = curve.model.with_parameter(curve.path, value)
     index = jnp.arange(rows, dtype=course.num.dtype)
     after = jnp.where(index >= course.num - 1, 0, index + 1)
     mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
@@ -159,34 +206,7 @@ def look_at(
 
     factors = jax.vmap(factor)(own, on, course.ends, field[after])
     factors = factors * curve.sizes[:, None] / curve.sizes[None, :]
-    factors = jnp.where((index < course.num)[:, None, None], factors, jnp.eye(n, dtype=u.dtype))
-
-    zeros = structural_zeros(model.system, jnp.where((index < course.num)[:, None], mode, mode[:1]))
-    found = floquet(factors, zeros, curve.autonomous)
-    free = jnp.any((course.ends == REPELLING_EXIT) & (index < course.num))
-    either = zip(_infinitely_unstable(n, curve.autonomous), found)
-    monodromy, multipliers, stable = (jnp.where(free, x, y) for x, y in either)
-
-    # Along the way.
-    inside = (index < course.num)[:, None]
-    along = _along(curve, model, value, begin, end, x, course, turns)
-    least = along.least[:, 2 * n :]
-    low, high = jnp.min(jnp.where(inside, along.least[:, : 2 * n], jnp.inf), axis=0).reshape(2, n)
-    length = jnp.sum(jnp.where(inside[:, 0], end - begin, 0))
-    mean, square = jnp.sum(jnp.where(inside[..., None], along.sums, 0), axis=0) / length
-    period = end[course.num - 1] - begin[0]
-    if not curve.autonomous:
-        period = jnp.asarray(model.system.period, u.dtype) * curve.order.astype(u.dtype)
-    turns_t = begin[:, None] + (end - begin)[:, None] * along.share[:, : 2 * n]
-    rates, values, margins = _at_ends(curve, model, end, last, course)
-    # Beside a branch point rounding moves the root by more than Newton's method is to find it to.
-    wrong = jnp.max(jnp.abs(f))
-    good = (good | (wrong < TOLERANCE)) & jnp.all(jnp.isfinite(tangent))
-    return PointData(
-        u, tangent, good, value, period, begin, end, x, last, factors, monodromy, multipliers, stable,
-        rates, values, margins, least, along.share[:, 2 * n :], along.most[:, 2 * n :], along.x[:, 2 * n :], low, -high,
-        mean, square, along.ts, along.xs, turns_t, along.x[:, : 2 * n], branch, wrong,
-    )  # fmt: skip
+    return jnp.where((index < course.num)[:, None, None], factors, jnp.eye(n, dtype=u.dtype))
 
 
 def _infinitely_unstable(n: int, autonomous: bool) -> tuple[Array, Array, Array]:
@@ -198,24 +218,20 @@ def _infinitely_unstable(n: int, autonomous: bool) -> tuple[Array, Array, Array]
 @eqx.filter_jit
 def extremes(curve: OrbitCurve, course: Course, u: Array) -> tuple[Array, Array]:
     """The least and the largest value of each component of the state along an orbit."""
-    begin, end, x, value = curve.parts(u)
-    model = curve.model.with_parameter(curve.path, value)
-    found = _along(curve, model, value, begin, end, x, course, turns=True, guards=False).least
-    inside = jnp.arange(len(begin), dtype=course.num.dtype) < course.num
+    found = _along(curve, course, u, turns=True, guards=False).least
+    inside = jnp.arange(len(found), dtype=course.num.dtype) < course.num
     low, high = jnp.min(jnp.where(inside[:, None], found, jnp.inf), axis=0).reshape(2, -1)
     return low, -high
 
 
-def _along(
-    curve: OrbitCurve, model: SwitchedSystem, value: Array, begin: Array, end: Array, x: Array, course: Course,
-    turns: bool, guards: bool = True,
-) -> Minima:  # fmt: skip
+def _along(curve: OrbitCurve, course: Course, u: Array, turns: bool, guards: bool = True) -> Minima:
     """Of every segment the least values of the state's components, of their negatives (with `turns` between nodes too),
     and of the guards, these divided by the zeros that they must have at the ends."""
-    rows, slots = len(begin), len(model.slots) * guards
+    begin, end, x, value = curve.parts(u)
+    rows, slots = len(begin), len(curve.model.slots) * guards
     orders = jnp.zeros((rows, 2, 0), x.dtype)
     if slots:
-        zeros = jnp.asarray(zeros_at_begin(curve, model, course), x.dtype)  # rows, slots
+        zeros = jnp.asarray(zeros_at_begin(curve, course), x.dtype)  # rows, slots
         here = jnp.arange(slots, dtype=course.slot.dtype) == course.slot[:, None]
         index = jnp.arange(rows, dtype=course.num.dtype)
         after = jnp.where(index >= course.num - 1, 0, index + 1)
@@ -225,16 +241,14 @@ def _along(
         orders = jnp.stack([zeros, last.astype(x.dtype)], axis=1)
     plain = jnp.zeros((rows, 2, 2 * len(curve.sizes)), x.dtype)
     orders = jnp.concatenate([plain, orders], axis=2)
-    return jax.vmap(lambda *segment: along_segment(curve, model, value, *segment, turns=turns))(
-        begin, end, x, jnp.asarray(course.mode), jnp.asarray(course.part), orders
-    )
+    segments = begin, end, x, jnp.asarray(course.mode), jnp.asarray(course.part)
+    return jax.vmap(lambda segment, orders: along_segment(curve, value, segment, orders, turns))(segments, orders)
 
 
-def along_segment(
-    curve: OrbitCurve, model: SwitchedSystem, value: Array, a: Scalar, b: Scalar, x: Array, mode: Array, part: Array,
-    orders: Array, turns: bool = True,
-) -> Minima:  # fmt: skip
-    """As `_along`, of one segment, with any orders of the zeros."""
+def along_segment(curve: OrbitCurve, value: Array, segment: tuple, orders: Array, turns: bool) -> Minima:
+    """As `_along`, of one segment (its two times, its first state, mode and parts), with any orders of the zeros."""
+    a, b, x, mode, part = segment
+    model = curve.model.with_parameter(curve.path, value)
     n, state = len(curve.sizes), curve.state(mode, part)
     slots = orders.shape[1] - 2 * n
     slack = jnp.concatenate(
@@ -261,8 +275,9 @@ def along_segment(
     return in_order(minima(sample, functions, x, orders[:, places], below), places)
 
 
-def zeros_at_begin(curve: OrbitCurve, model: SwitchedSystem, course: Course) -> Array:
+def zeros_at_begin(curve: OrbitCurve, course: Course) -> Array:
     """How many zeros each guard has at the beginning of each segment: that of the surface just left."""
+    model = curve.model
     index = jnp.arange(len(course.slot), dtype=course.num.dtype)
     before = jnp.where(index == 0, course.num - 1, index - 1)
     slot, ends, mode_before = course.slot[before], course.ends[before], jnp.asarray(course.mode)[before]
@@ -275,7 +290,7 @@ def zeros_at_begin(curve: OrbitCurve, model: SwitchedSystem, course: Course) -> 
     for s in model.slots:
         k = s.switch
         left = (switch == k) & ((ends == EVENT) | (ends == REPELLING_EXIT))
-        if s.holding or isinstance(model.switches[k], relay):
+        if s.holding or model.switches[k].order == 0:
             columns.append(jnp.zeros(len(index)))
             continue
         free = jnp.ones(len(index), bool)

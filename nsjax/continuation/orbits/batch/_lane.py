@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ...._types import Scalar
 from ....orbits.segments._equations import OrbitCurve
 from ....orbits.segments._itinerary import Course
-from ....orbits.segments._point import PointData, step_on
+from ....orbits.segments._point import corrected, Plane, PointData
 from .._test_functions import BRANCH, branch_value, CIRCLE, circle_values, corner_tests, corner_values, PASSED, Test
 from .._tracer import FIRST, SHORTEST, TURN, TURNED
 
@@ -99,7 +99,7 @@ def follow_lane(
     zero, none = jnp.zeros_like(u[0]), jnp.zeros((), jnp.int32)
     border = jnp.zeros_like(u).at[-1].set(1)
     blank = jax.eval_shape(
-        lambda: place_of(curve, step_on(curve, course, u, border, zero, u, turns=False), course, zero)
+        lambda: place_of(curve, corrected(curve, course, Plane(u, border, zero), u, turns=False), course, zero)
     )
     at = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)._replace(u=u, tangent=border)
     rows = jax.tree.map(lambda x: jnp.zeros((points, *x.shape), x.dtype), blank.row)
@@ -141,7 +141,8 @@ def _moved(curve: OrbitCurve, course: Course, lane: Lane, ends: Array, upwards: 
     at, locating, starting = lane.at, lane.doing == LOCATING, lane.doing == STARTING
     chord = (lane.far.u - at.u) / jnp.where(locating, lane.length, 1)
     s = jnp.where(locating, _between(lane), lane.length)
-    look = step_on(curve, course, at.u, at.tangent, s, at.u + s * jnp.where(locating, chord, at.tangent), turns=False)
+    guess = at.u + s * jnp.where(locating, chord, at.tangent)
+    look = corrected(curve, course, Plane(at.u, at.tangent, s), guess, turns=False)
     turn = jnp.where(starting & (look.tangent[-1] * upwards < 0), -1, 1).astype(s.dtype)
     # The sign of a determinant of which the tangent is a row.
     look = look._replace(tangent=turn * look.tangent, branch=look.branch * jnp.stack([turn, jnp.ones_like(turn)]))

@@ -7,7 +7,7 @@ from ....orbits.segments._equations import linearised, OrbitCurve
 from ....orbits.segments._itinerary import capacity_for, EVENT, GRAZING, REPELLING_EXIT, Start
 from ....setvalued._eigenvalue_crossings import eigenvalue_crossings
 from ....system._impact import impact
-from .._bifurcation import named, OrbitBifurcation, Origin
+from .._bifurcation import OrbitBifurcation, Origin
 from .._branch_switching import (
     branch_point_at,
     cover_of,
@@ -75,7 +75,7 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
         half for cycle in cycles.cycles if (half := half_of(tracer, spot, mapped.corner, points, cycle)) is not None
     ]
     _pair(halves)
-    made = described(name, curve, spot, mapped, cycles, halves, touches, arrived)
+    made = described(name, curve, spot, mapped, cycles, halves, touches=touches, arrived=arrived)
     return Node(spot, int(curve.order), halves, made)
 
 
@@ -179,6 +179,7 @@ def described(
     mapped: ReturnMap,
     cycles: Cycles,
     halves: list[Half],
+    *,
     touches: list[Touch],
     arrived: tuple[int, ...],
 ) -> OrbitBifurcation:
@@ -206,17 +207,17 @@ def described(
     monodromies = [np.full_like(m, np.inf) if lost else m for m, lost in zip(monodromies, infinite)]
     alone = {h.cycle.word: h.multipliers for h in halves if h.laps == 1 and h.cycle is not None}
     values = [alone[w] if lost and w in alone else _multipliers(m) for w, m, lost in zip(words, monodromies, infinite)]
-    return named(
-        by_count,
-        crossings if finite else None,
+    return OrbitBifurcation.corner(
         name,
         spot,
         curve,
         [told(h) for h in halves],
-        surfaces,
-        (monodromies[0], monodromies[1]),
-        (values[0], values[1]),
-        "sliding" if len({_held(curve, h.spot) for h in halves if h.laps == 1}) > 1 else None,
+        by_count,
+        crossings if finite else None,
+        surfaces=surfaces,
+        monodromies=(monodromies[0], monodromies[1]),
+        multipliers=(values[0], values[1]),
+        transition="sliding" if len({_held(curve, h.spot) for h in halves if h.laps == 1}) > 1 else None,
     )
 
 
