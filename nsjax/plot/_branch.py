@@ -6,7 +6,7 @@ from typing import Any, TYPE_CHECKING
 import jax
 import numpy as np
 
-from ..continuation.equilibria._bifurcation import Bifurcation, NOT_BIFURCATIONS
+from ..continuation.equilibria._bifurcation import Bifurcation
 from ..continuation.equilibria._branch import Branch
 from ..orbits._orbit import Orbit
 from ..system._parameter import get_parameter, parameter_path
@@ -97,6 +97,6 @@ def _periodic(ax: "Axes", family: Sequence[Orbit], parameter: str, measure: str 
 def _point(ax: "Axes", special: Bifurcation, measure: str | Callable[[Any], Any]) -> tuple[float, float, str]:
     """Marks it, and says where it is and what is written beside it."""
     height = float(_measured(measure, jax.tree.map(lambda x: np.asarray(x)[None], special.y))[0])
-    bifurcation = special.kind not in NOT_BIFURCATIONS
+    bifurcation = special.is_bifurcation
     mark(ax, special.value, height, special.discontinuous, bifurcation)
     return special.value, height, wording(special.name, keep=special.kind == "none")

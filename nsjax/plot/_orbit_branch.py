@@ -9,7 +9,7 @@ from jaxtyping import Complex, Float
 from scipy.optimize import linear_sum_assignment
 
 from ..continuation.orbits._bifurcation import OrbitBifurcation
-from ..continuation.orbits._branch import NOT_BIFURCATIONS, OrbitBranch
+from ..continuation.orbits._branch import OrbitBranch
 from ..derivatives._floquet import trivial
 from ..setvalued._eigenvalue_crossings import eigenvalue_path as path_between
 from ._diagram import LINE, mark, stretches, UNSTABLE, wording, write_names
@@ -80,7 +80,7 @@ def orbit_diagram(
     words = []
     for special, k, i in _special_points(branch):
         height = float(heights[k][i])
-        mark(ax, special.value, height, special.discontinuous, special.kind not in NOT_BIFURCATIONS)
+        mark(ax, special.value, height, special.discontinuous, special.is_bifurcation)
         words.append((special.value, height, _words(names, special)))
     _write(ax, words)
     ax.set_xlabel(axis_label(labels, branch.parameter))
@@ -155,7 +155,7 @@ def multiplier_diagram(
     for found in special:
         ends = _ends(found, autonomous, which)
         places = heights(ends)
-        color = "0.5" if found.kind in NOT_BIFURCATIONS else "C3" if found.discontinuous else "C0"
+        color = "0.5" if not found.is_bifurcation else "C3" if found.discontinuous else "C0"
         clip = dict(clip_on=not np.isinf(ends).any())
         ax.plot(np.full(len(places), found.value), places, color=color, **HALF, **clip)
         words.append((found.value, float(np.max(places)), _words(names, found)))

@@ -116,7 +116,7 @@ CASES = {
     "a branch of orbits": (ORBITS, 8, "1 branch of periodic orbits of ForcedFriction", "fold bifurcation at omega"),
     "a bifurcation of orbits": (CORNER, 5, "discontinuous fold bifurcation at omega = 1.5", "surfaces     friction"),
     "half of it": (
-        nsjax.continuation.OrbitHalf(1, 2, np.array([0.5, 0.1]), False, "belt -1 -> belt +0 " * 20),
+        nsjax.continuation.OrbitHalfBranch(1, 2, np.array([0.5, 0.1]), False, "belt -1 -> belt +0 " * 20),
         1, "unstable half-branch above, period 2: belt -1 -> belt +0", " ...; multipliers 0.5, 0.1",
     ),
     "lanes": (LANES, 3, "1 branches of periodic orbits of StickSlip: 2 points", "1 times: fold"),

@@ -283,7 +283,7 @@ def test_mistakes(duffing, change, message):
 
 def test_a_loaded_point(duffing):
     with pytest.raises(ValueError, match="loaded from a file"):
-        continue_bifurcation(duffing.bifurcations[0]._replace(origin=None), "F", (0.5, 1.5))
+        continue_bifurcation(dataclasses.replace(duffing.bifurcations[0], origin=None), "F", (0.5, 1.5))
 
 
 @pytest.mark.slow

@@ -1,7 +1,8 @@
 """Special points of branches, and what makes them so."""
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.flatten_util as jfu
 import numpy as np
@@ -9,13 +10,11 @@ import numpy as np
 from ..._numerics._text import listed, shown
 from ..._types import Y
 from ...setvalued._pencil import EigenvalueCrossing
-
-
-NOT_BIFURCATIONS = ("none", "hysteresis point", "end")
+from .._special_point import AbstractHalfBranch, AbstractSpecialPoint
 
 
 @shown
-class HalfBranch(NamedTuple):
+class HalfBranch(AbstractHalfBranch):
     """A branch on one side of a special point.
 
     **Attributes:**
@@ -41,11 +40,11 @@ class HalfBranch(NamedTuple):
 
     def __str__(self) -> str:
         mode = f"mode ({listed(self.mode)}), " if len(self.mode) else ""
-        return f"{half_branch(self.stable, self.side)}: {mode}eigenvalues {listed(self.eigenvalues, 6, 4)}"
+        return f"{self.place}: {mode}eigenvalues {listed(self.eigenvalues, 6, 4)}"
 
 
 @shown
-class Bifurcation(NamedTuple):
+class Bifurcation(AbstractSpecialPoint):
     """A special point of a branch: a bifurcation, or a place that is none though it looks like one.
 
     **Attributes:**
@@ -73,6 +72,12 @@ class Bifurcation(NamedTuple):
     - `orbits`: how many of them were found below and above; None if nobody looked. See `hopf_orbits`.
     """
 
+    plain = {
+        "hysteresis point": "hysteresis point",
+        "end": "end",
+        "continuum": "continuum of equilibria",
+    }
+
     kind: str
     discontinuous: bool
     criticality: str | None
@@ -90,17 +95,8 @@ class Bifurcation(NamedTuple):
     period: float | None
     orbits: tuple[int, int] | None = None
 
-    @property
-    def name(self) -> str:
-        """As the thesis says it: "discontinuous pitchfork bifurcation, supercritical"."""
-        if self.kind == "none":
-            return "no bifurcation: " + ("the eigenvalues jump" if self.crossings == [] else "corner")
-        if self.kind in NOT_BIFURCATIONS:
-            return self.kind
-        if self.kind == "continuum":
-            return "continuum of equilibria"
-        words = ["discontinuous"] * self.discontinuous + [self.kind, "bifurcation"]
-        return " ".join(words) + (f", {self.criticality}" if self.criticality else "")
+    def _what_happens(self) -> str:
+        return "the eigenvalues jump" if self.crossings == [] else "corner"
 
     def with_orbits(self, below: Sequence[Sequence[Any]], above: Sequence[Sequence[Any]]) -> "Bifurcation":
         """The same, with the count of periodic orbits that `hopf_orbits` finds for further evidence (Definition 5.1). A
@@ -112,7 +108,7 @@ class Bifurcation(NamedTuple):
         if self.kind == "Hopf" and len(stable) == 1:
             criticality = "supercritical" if stable.pop() else "subcritical"
         evidence = "both" if self.by_count == "none" else self.evidence
-        return self._replace(orbits=(len(below), len(above)), evidence=evidence, criticality=criticality)
+        return dataclasses.replace(self, orbits=(len(below), len(above)), evidence=evidence, criticality=criticality)
 
     def __str__(self) -> str:
         state = ", ".join(f"{_plain(x)}" for x in np.asarray(jfu.ravel_pytree(self.y)[0]))
@@ -130,10 +126,6 @@ class Bifurcation(NamedTuple):
         if self.period is not None:
             lines.append(f"  period     {self.period:.12g}")
         return "\n".join(lines)
-
-
-def half_branch(stable: bool, side: int) -> str:
-    return f"{'stable' if stable else 'unstable'} half-branch {('at the point', 'above', 'below')[side]}"
 
 
 def unstable_number(roots: Any) -> Any:

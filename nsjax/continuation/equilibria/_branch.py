@@ -1,10 +1,7 @@
 """Branches of equilibria."""
 
 import dataclasses
-import os
-from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
@@ -13,8 +10,9 @@ from ..._numerics._text import shown
 from ..._types import Y
 from ...setvalued._pencil import EigenvalueCrossing
 from ...system._system import System
-from .._archive import Archive, save, table
-from ._bifurcation import Bifurcation, HalfBranch, NOT_BIFURCATIONS, unstable_number
+from .._archive import table
+from .._branch import AbstractBranch
+from ._bifurcation import Bifurcation, HalfBranch, unstable_number
 from ._equations import Record
 
 
@@ -22,7 +20,7 @@ CLOSED = "the start: it is closed"
 
 
 @shown
-class Branch(eqx.Module):
+class Branch(AbstractBranch):
     """A curve of equilibria over a parameter.
 
     **Attributes:**
@@ -54,53 +52,11 @@ class Branch(eqx.Module):
     ends: tuple[str, str]
     others: "tuple[Branch, ...]" = ()
 
-    @property
-    def branches(self) -> "tuple[Branch, ...]":
-        """This one and the others."""
-        return (self, *self.others)
-
-    @property
-    def bifurcations(self) -> tuple[Bifurcation, ...]:
-        """Those of all branches, each once, in the order of the parameter."""
-        found: dict[int, Bifurcation] = {}
-        for branch in self.branches:
-            found |= {id(b): b for b in branch.special if b.kind not in NOT_BIFURCATIONS}
-        return tuple(sorted(found.values(), key=lambda b: b.value))
-
-    def save(self, path: str | os.PathLike) -> None:
-        """Writes the branch and the others to a file, an `.npz` of plain arrays with a description in JSON."""
-        save(path, "Branch", TYPES, self.system, jax.tree.map(lambda x: x[0], self.ys), {"branch": self})
-
-    @classmethod
-    def load(cls, path: str | os.PathLike, system: System, y: Y | None = None) -> "Branch":
-        """Reads what `save` wrote; arguments and errors as for `OrbitBranch.load`."""
-        return Archive(path, "Branch", TYPES, system, y).part("branch")
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-    def __str__(self) -> str:
-        lines = [f"{len(self.branches)} {'branches' if self.others else 'branch'} of {type(self.system).__name__}"]
-        seen: list[Any] = []
-        for branch in self.branches:
-            low, high = float(np.min(branch.values)), float(np.max(branch.values))
-            lines.append(f"  {self.parameter} in [{low:.6g}, {high:.6g}]: {len(branch)} points, {_stability(branch)}")
-            lines.append(f"    from {branch.ends[0]} to {branch.ends[1]}")
-            for special in branch.special:
-                known = any(special is other for other in seen)
-                lines += [f"    {line}" for line in str(special).splitlines()[: 1 if known else None]]
-                seen.append(special)
-        return "\n".join(lines)
+    def _headline(self) -> str:
+        return f"{len(self.branches)} {'branches' if self.others else 'branch'} of {type(self.system).__name__}"
 
 
-def _stability(branch: Branch) -> str:
-    """ "stable, then unstable": runs along the branch."""
-    words = ["stable" if s else "unstable" for s in branch.stable]
-    runs = [word for i, word in enumerate(words) if i == 0 or words[i - 1] != word]
-    return ", then ".join(runs) if len(runs) <= 6 else f"{len(runs)} changes of stability"
-
-
-TYPES = table(Branch, Bifurcation, HalfBranch, EigenvalueCrossing)
+Branch.saved = table(Branch, Bifurcation, HalfBranch, EigenvalueCrossing)
 
 
 @dataclasses.dataclass

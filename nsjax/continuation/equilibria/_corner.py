@@ -157,7 +157,7 @@ def node_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, arrivi
     smooth = () if all(half.regular for half in halves) else ("branch point",)
     bifurcation = _described(curve, name, u, halves, first, surfaces=met, continuous=continuous, smooth=smooth)
     if degenerate and not met:
-        bifurcation = bifurcation._replace(kind="degenerate branch point", evidence="crossing")
+        bifurcation = dataclasses.replace(bifurcation, kind="degenerate branch point", evidence="crossing")
     return Node(u, halves, bifurcation)
 
 
@@ -257,7 +257,7 @@ def fold_at(
     found = _described(curve, name, u, [half for half in both if half is not None], None, smooth=("saddle-node",))
     if found.kind != "none":
         return found
-    return found._replace(kind="hysteresis point", by_crossing=("saddle-node", "saddle-node"))
+    return dataclasses.replace(found, kind="hysteresis point", by_crossing=("saddle-node", "saddle-node"))
 
 
 def hopf_at(
@@ -288,7 +288,7 @@ def hopf_at(
     by_crossing = ("Hopf",) * pairs
     kind, evidence = classified(found.by_count, by_crossing)
     known = dict(kind=kind, evidence=evidence, by_crossing=by_crossing, criticality=criticality)
-    return found._replace(**known, period=float(2 * np.pi / omega))
+    return dataclasses.replace(found, **known, period=float(2 * np.pi / omega))
 
 
 def start_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, tangent: Any) -> Bifurcation | None:

@@ -12,7 +12,7 @@ from ..._types import Y
 from ...maps._corner_normal_form import CornerKind
 from ...orbits.segments._equations import OrbitCurve
 from ...setvalued._pencil import EigenvalueCrossing
-from ..equilibria._bifurcation import half_branch
+from .._special_point import AbstractHalfBranch, AbstractSpecialPoint
 from ._test_functions import Test
 from ._tracer import OrbitPoint
 
@@ -33,7 +33,7 @@ class Origin(NamedTuple):
 
 
 @shown
-class OrbitHalf(NamedTuple):
+class OrbitHalfBranch(AbstractHalfBranch):
     """A branch on one side of a special point.
 
     **Attributes:**
@@ -54,11 +54,11 @@ class OrbitHalf(NamedTuple):
     def __str__(self) -> str:
         way = textwrap.shorten(self.itinerary, 60, placeholder=" ...") or "no events"
         multipliers = listed(self.multipliers, 4, 2)
-        return f"{half_branch(self.stable, self.side)}, period {self.laps}: {way}; multipliers {multipliers}"
+        return f"{self.place}, period {self.laps}: {way}; multipliers {multipliers}"
 
 
 @shown
-class OrbitBifurcation(NamedTuple):
+class OrbitBifurcation(AbstractSpecialPoint):
     """A special point of a branch of periodic orbits.
 
     **Attributes:**
@@ -86,6 +86,8 @@ class OrbitBifurcation(NamedTuple):
     - `origin`: what `continue_bifurcation` sets out from; None if the point was loaded.
     """
 
+    plain = {"end": "end of the branch"}
+
     kind: str
     discontinuous: bool
     criticality: str | None
@@ -103,20 +105,13 @@ class OrbitBifurcation(NamedTuple):
     multipliers: tuple[np.ndarray, np.ndarray]
     monodromies: tuple[np.ndarray, np.ndarray]
     crossings: Sequence[EigenvalueCrossing]
-    halves: Sequence[OrbitHalf]
+    halves: Sequence[OrbitHalfBranch]
     origin: "Origin | None" = None
 
-    @property
-    def name(self) -> str:
-        """As the thesis says it: "discontinuous fold bifurcation"."""
-        if self.kind == "none":
-            jump = not np.allclose(*self.multipliers, rtol=1e-5, atol=1e-6)
-            plain = "the multipliers jump" if jump else "the itinerary changes"
-            return "no bifurcation: " + ("sliding-mode transition" if self.transition else plain)
-        if self.kind == "end":
-            return "end of the branch"
-        words = ["discontinuous"] * self.discontinuous + [self.kind, "bifurcation"]
-        return " ".join(words) + (f", {self.criticality}" if self.criticality else "")
+    def _what_happens(self) -> str:
+        jump = not np.allclose(*self.multipliers, rtol=1e-5, atol=1e-6)
+        plain = "the multipliers jump" if jump else "the itinerary changes"
+        return "sliding-mode transition" if self.transition else plain
 
     def __str__(self) -> str:
         lines = [f"{self.name} at {self.parameter} = {self.value:.12g}, period {self.period:.12g}"]
@@ -131,7 +126,7 @@ class OrbitBifurcation(NamedTuple):
 
     @classmethod
     def smooth(
-        cls, kind: str, name: str, spot: Any, curve: Any, halves: Sequence[OrbitHalf], side: int = 0
+        cls, kind: str, name: str, spot: Any, curve: Any, halves: Sequence[OrbitHalfBranch], side: int = 0
     ) -> "OrbitBifurcation":
         """A point at which a multiplier crosses the circle without a jump; of a fold, on which side its orbits are."""
         below, above = (tuple(sorted(h.laps for h in halves if h.side == side)) for side in (-1, 1))
@@ -156,7 +151,7 @@ class OrbitBifurcation(NamedTuple):
 
     @classmethod
     def corner(
-        cls, name: str, spot: Any, curve: Any, halves: Sequence[OrbitHalf], by_count: CornerKind,
+        cls, name: str, spot: Any, curve: Any, halves: Sequence[OrbitHalfBranch], by_count: CornerKind,
         crossings: Sequence[EigenvalueCrossing] | None, *, surfaces: tuple[str, ...],
         monodromies: tuple[np.ndarray, np.ndarray], multipliers: tuple[np.ndarray, np.ndarray], transition: str | None,
     ) -> "OrbitBifurcation":  # fmt: skip
@@ -182,7 +177,7 @@ class OrbitBifurcation(NamedTuple):
 
     @classmethod
     def repelled(
-        cls, name: str, spot: Any, curve: Any, halves: Sequence[OrbitHalf], surfaces: tuple[str, ...]
+        cls, name: str, spot: Any, curve: Any, halves: Sequence[OrbitHalfBranch], surfaces: tuple[str, ...]
     ) -> "OrbitBifurcation":
         below, above = (tuple(1 for h in halves if h.side == side) for side in (-1, 1))
         kind = "infinitely unstable fold" if len(below) != len(above) else "none"
@@ -212,7 +207,7 @@ def _common(name: str, spot: Any, curve: Any) -> dict[str, Any]:
     return dict(parameter=name, value=spot.parameter, period=float(look.period), t=float(look.begin[0]), y=y)
 
 
-def _twins(halves: Sequence[OrbitHalf]) -> list[OrbitHalf]:
+def _twins(halves: Sequence[OrbitHalfBranch]) -> list[OrbitHalfBranch]:
     """The two that lie on the side on which there are three."""
     for side in (-1, 1):
         here = [h for h in halves if h.side == side]
@@ -221,7 +216,7 @@ def _twins(halves: Sequence[OrbitHalf]) -> list[OrbitHalf]:
     return []
 
 
-def _criticality(spot: Any, born: OrbitHalf) -> str:
+def _criticality(spot: Any, born: OrbitHalfBranch) -> str:
     unstable = int(np.sum(np.abs(born.multipliers) > 1 + 1e-9))
     at = int(np.sum(np.abs(spot.multipliers) > 1 + 1e-6))
     return "supercritical" if unstable <= at else "subcritical"

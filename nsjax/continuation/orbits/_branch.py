@@ -2,10 +2,8 @@
 
 import dataclasses
 import math
-import os
 from typing import Any, Generic, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,17 +19,15 @@ from ...orbits.segments._itinerary import GRAZING, REPELLING_EXIT, TIME
 from ...setvalued._pencil import EigenvalueCrossing
 from ...system._parameter import parameter_path, put_parameter
 from ...system._system import System
-from .._archive import Archive, save, table
-from ._bifurcation import OrbitBifurcation, OrbitHalf, Origin
+from .._archive import table
+from .._branch import AbstractBranch
+from ._bifurcation import OrbitBifurcation, OrbitHalfBranch, Origin
 from ._record import states_of
 from ._tracer import midpoint, OrbitPoint
 
 
-NOT_BIFURCATIONS = ("none", "end")
-
-
 @shown
-class OrbitBranch(eqx.Module, Generic[StateT]):
+class OrbitBranch(AbstractBranch, Generic[StateT]):
     """A curve of periodic orbits over a parameter.
 
     **Attributes:**
@@ -77,23 +73,7 @@ class OrbitBranch(eqx.Module, Generic[StateT]):
     ends: tuple[str, str]
     others: "tuple[OrbitBranch[StateT], ...]" = ()
 
-    @property
-    def branches(self) -> "tuple[OrbitBranch[StateT], ...]":
-        """This one and the others."""
-        return (self, *self.others)
-
-    @property
-    def special_points(self) -> tuple[OrbitBifurcation, ...]:
-        """Those of all branches, each once, in the order of the parameter."""
-        found: dict[int, OrbitBifurcation] = {}
-        for branch in self.branches:
-            found |= {id(b): b for b in branch.special}
-        return tuple(sorted(found.values(), key=lambda b: b.value))
-
-    @property
-    def bifurcations(self) -> tuple[OrbitBifurcation, ...]:
-        """Those of them that are bifurcations."""
-        return tuple(b for b in self.special_points if b.kind not in NOT_BIFURCATIONS)
+    not_saved = (Origin,)
 
     def system_at(self, index: int) -> System:
         """The model with the parameter's value at a point."""
@@ -124,54 +104,20 @@ class OrbitBranch(eqx.Module, Generic[StateT]):
         y0 = jax.tree.map(lambda x: jnp.asarray(x[index]), self.ys)
         return find_orbit(system, y0, t0=t0, order=int(self.orders[index]), **guess, **options)
 
-    def save(self, path: str | os.PathLike) -> None:
-        """Writes the branch and the others to a file, an `.npz` of plain arrays with a description in JSON."""
-        save(
-            path, "OrbitBranch", TYPES, self.system, jax.tree.map(lambda x: x[0], self.ys), {"branch": self}, (Origin,)
-        )
-
-    @classmethod
-    def load(cls, path: str | os.PathLike, system: System, y: Y | None = None) -> "OrbitBranch":
-        """Reads what `save` wrote. Nothing in the file is executed.
-
-        **Arguments:**
-
-        - `path`: the file.
-        - `system`: a model of the same class and shapes; the values of its parameters are taken from the file.
-        - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
-            NamedTuples.
-
-        **Raises:** `ValueError` for a file that is damaged, is none of `save`'s, or is of another model.
-        """
-        return Archive(path, "OrbitBranch", TYPES, system, y).part("branch")
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-    def __str__(self) -> str:
+    def _headline(self) -> str:
         count = sum(bool(branch.admissible.any()) for branch in self.branches)
         virtual = f", {len(self.branches) - count} virtual" if count < len(self.branches) else ""
         owner = type(self.system).__name__
-        lines = [f"{count} {'branch' if count == 1 else 'branches'} of periodic orbits of {owner}{virtual}"]
-        seen: list[Any] = []
-        for branch in self.branches:
-            low, high = float(np.min(branch.values)), float(np.max(branch.values))
-            words = ["stable" if s else "unstable" for s in branch.stable]
-            words = [word if real else "virtual" for word, real in zip(words, branch.admissible)]
-            runs = [word for i, word in enumerate(words) if i == 0 or words[i - 1] != word]
-            told = ", then ".join(runs) if len(runs) <= 6 else f"{len(runs) - 1} changes of stability"
-            order = int(branch.orders[0])
-            period = f"period {order}, " if branch.system.period is not None else ""
-            lines.append(f"  {period}{self.parameter} in [{low:.6g}, {high:.6g}]: {len(branch)} points, {told}")
-            lines.append(f"    from {branch.ends[0]} to {branch.ends[1]}")
-            for special in branch.special:
-                known = any(special is other for other in seen)
-                lines += [f"    {line}" for line in str(special).splitlines()[: 1 if known else None]]
-                seen.append(special)
-        return "\n".join(lines)
+        return f"{count} {'branch' if count == 1 else 'branches'} of periodic orbits of {owner}{virtual}"
+
+    def _period(self) -> str:
+        return f"period {int(self.orders[0])}, " if self.system.period is not None else ""
+
+    def _words(self) -> list[str]:
+        return [word if real else "virtual" for word, real in zip(super()._words(), self.admissible)]
 
 
-TYPES = table(OrbitBranch, OrbitBifurcation, OrbitHalf, EigenvalueCrossing, Segment)
+OrbitBranch.saved = table(OrbitBranch, OrbitBifurcation, OrbitHalfBranch, EigenvalueCrossing, Segment)
 
 
 class Point(NamedTuple):

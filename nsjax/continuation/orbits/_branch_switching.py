@@ -10,7 +10,7 @@ from ...maps._corner_normal_form import Cycle
 from ...orbits.segments._equations import linearised, OrbitCurve, state_at
 from ...orbits.segments._itinerary import capacity_for, Course, Start, TIME
 from ...orbits.segments._point import correct, Plane
-from ._bifurcation import OrbitBifurcation, OrbitHalf
+from ._bifurcation import OrbitBifurcation, OrbitHalfBranch
 from ._test_functions import CORNERS
 from ._tracer import alike, midpoint, OrbitPoint, OrbitTracer, spot_of, told_by, turned, Zero
 
@@ -195,9 +195,9 @@ def side_of(half: OrbitPoint, at: OrbitPoint, curve: OrbitCurve) -> int:
     return int(np.sign(half.parameter - at.parameter)) or int(np.sign(half.look.tangent[-1]))
 
 
-def told(half: Half) -> OrbitHalf:
+def told(half: Half) -> OrbitHalfBranch:
     spot = half.spot
-    return OrbitHalf(half.side, half.laps, half.multipliers, spot.stable, itinerary(half.curve, spot.course))
+    return OrbitHalfBranch(half.side, half.laps, half.multipliers, spot.stable, itinerary(half.curve, spot.course))
 
 
 def itinerary(curve: OrbitCurve, course: Course) -> str:

@@ -23,7 +23,7 @@ from ...system._system import System
 from .._archive import Archive, plain, save, table
 from .._progress import ProgressLine
 from ._bifurcation import Origin
-from ._branch import orbit_branch, OrbitBranch, OrbitStrand, Point, TYPES as OF_BRANCHES
+from ._branch import orbit_branch, OrbitBranch, OrbitStrand, Point
 from ._branch_switching import Half, itinerary, Node
 from ._explorer import Exit, Frontier, OrbitExplorer, OrbitTree
 from ._record import Measures, Recorder
@@ -34,7 +34,7 @@ from ._tracer import Arc, OrbitPoint, OrbitTracer, Zero
 
 GIVEN = ("model", "path", "like", "integrator")  # what of a curve follows from the model, and is not saved
 TYPES = {
-    **OF_BRANCHES,
+    **OrbitBranch.saved,
     **table(
         OrbitTree,
         Frontier,

@@ -39,7 +39,7 @@ def node_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | Non
     if zero.test.kind in (*CORNERS, "grazing"):
         node = corner_at(tracer, name, zero, most)
         if node is not None:
-            node.bifurcation = node.bifurcation._replace(origin=Origin(zero.test, zero.spot, tracer.curve))
+            node.bifurcation = dataclasses.replace(node.bifurcation, origin=Origin(zero.test, zero.spot, tracer.curve))
         return node
     return None
 

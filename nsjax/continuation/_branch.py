@@ -1,0 +1,100 @@
+"""What branches have in common, be they of equilibria or of periodic orbits."""
+
+import os
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .._types import Y
+from ..system._system import System
+from ._archive import Archive, save, Types
+from ._special_point import AbstractSpecialPoint
+
+
+class AbstractBranch(eqx.Module):
+    """A curve of solutions over a parameter; see `Branch` and `OrbitBranch`."""
+
+    saved: ClassVar[Types]  # the types of what a file holds
+    not_saved: ClassVar[tuple[type, ...]] = ()
+
+    system: eqx.AbstractVar[System]
+    parameter: eqx.AbstractVar[str]
+    values: eqx.AbstractVar[Float[np.ndarray, " points"]]
+    ys: eqx.AbstractVar[Y]
+    stable: eqx.AbstractVar[Bool[np.ndarray, " points"]]
+    special: eqx.AbstractVar[tuple[Any, ...]]
+    ends: eqx.AbstractVar[tuple[str, str]]
+    others: eqx.AbstractVar[tuple[Any, ...]]
+
+    @property
+    def branches(self) -> tuple[Self, ...]:
+        """This one and the others."""
+        return (self, *self.others)
+
+    @property
+    def special_points(self) -> tuple[Any, ...]:
+        """Those of all branches, each once, in the order of the parameter."""
+        found: dict[int, AbstractSpecialPoint] = {}
+        for branch in self.branches:
+            found |= {id(b): b for b in branch.special}
+        return tuple(sorted(found.values(), key=lambda b: b.value))
+
+    @property
+    def bifurcations(self) -> tuple[Any, ...]:
+        """Those of them that are bifurcations."""
+        return tuple(b for b in self.special_points if b.is_bifurcation)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes the branch and the others to a file, an `.npz` of plain arrays with a description in JSON."""
+        y = jax.tree.map(lambda x: x[0], self.ys)
+        save(path, type(self).__name__, self.saved, self.system, y, {"branch": self}, self.not_saved)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike, system: System, y: Y | None = None) -> Self:
+        """Reads what `save` wrote. Nothing in the file is executed.
+
+        **Arguments:**
+
+        - `path`: the file.
+        - `system`: a model of the same class and shapes; the values of its parameters are taken from the file.
+        - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
+            NamedTuples.
+
+        **Raises:** `ValueError` for a file that is damaged, is none of `save`'s, or is of another model.
+        """
+        return Archive(path, cls.__name__, cls.saved, system, y).part("branch")
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __str__(self) -> str:
+        lines, seen = [self._headline()], []
+        for branch in self.branches:
+            low, high = float(np.min(branch.values)), float(np.max(branch.values))
+            what = f"{branch._period()}{self.parameter} in [{low:.6g}, {high:.6g}]"
+            lines.append(f"  {what}: {len(branch)} points, {branch._stability()}")
+            lines.append(f"    from {branch.ends[0]} to {branch.ends[1]}")
+            for special in branch.special:
+                known = any(special is other for other in seen)
+                lines += [f"    {line}" for line in str(special).splitlines()[: 1 if known else None]]
+                seen.append(special)
+        return "\n".join(lines)
+
+    def _headline(self) -> str:
+        raise NotImplementedError
+
+    def _period(self) -> str:
+        return ""
+
+    def _words(self) -> list[str]:
+        """What each point is."""
+        return ["stable" if s else "unstable" for s in self.stable]
+
+    def _stability(self) -> str:
+        """ "stable, then unstable": runs along the branch."""
+        words = self._words()
+        runs = [word for i, word in enumerate(words) if i == 0 or words[i - 1] != word]
+        return ", then ".join(runs) if len(runs) <= 6 else f"{len(runs) - 1} changes of stability"

@@ -1,0 +1,50 @@
+"""What special points of branches have in common, be the branches of equilibria or of periodic orbits."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+
+from ..setvalued._pencil import EigenvalueCrossing
+
+
+class AbstractHalfBranch(eqx.Module):
+    """A branch on one side of a special point: -1 below its parameter value, +1 above it, 0 where it stays there."""
+
+    side: eqx.AbstractVar[int]
+    stable: eqx.AbstractVar[bool]
+
+    @property
+    def place(self) -> str:
+        return f"{'stable' if self.stable else 'unstable'} half-branch {('at the point', 'above', 'below')[self.side]}"
+
+
+class AbstractSpecialPoint(eqx.Module):
+    """A bifurcation, or a place that is none though it looks like one; see `Bifurcation` and `OrbitBifurcation`."""
+
+    plain: ClassVar[dict[str, str]]  # kinds that are no bifurcations, and how they are named
+
+    kind: eqx.AbstractVar[str]
+    discontinuous: eqx.AbstractVar[bool]
+    criticality: eqx.AbstractVar[str | None]
+    value: eqx.AbstractVar[float]
+    crossings: eqx.AbstractVar[Sequence[EigenvalueCrossing]]
+
+    @property
+    def is_bifurcation(self) -> bool:
+        """Whether it is one: not where the branch crosses a surface and nothing else happens, nor where it ends."""
+        return self.kind != "none" and self.kind not in self.plain
+
+    @property
+    def name(self) -> str:
+        """As the thesis says it: "discontinuous pitchfork bifurcation, supercritical"."""
+        if self.kind == "none":
+            return f"no bifurcation: {self._what_happens()}"
+        if self.kind in self.plain:
+            return self.plain[self.kind]
+        words = ["discontinuous"] * self.discontinuous + [self.kind, "bifurcation"]
+        return " ".join(words) + (f", {self.criticality}" if self.criticality else "")
+
+    def _what_happens(self) -> str:
+        """At a point that is no bifurcation."""
+        raise NotImplementedError
