@@ -15,7 +15,7 @@ from ..plot._diagram import write_names
 from ..plot._orbit_branch import amplitude
 from ._job import Job, UsageError
 from ._pictures import figure, save
-from ._report import named, Units
+from ._report import by_name, Units
 
 
 SHORT = 0.12  # of the width and height of a picture
@@ -251,7 +251,7 @@ def _points(branch: OrbitBranch) -> Iterator[dict[str, Any]]:
             "period": branch.periods[i],
             "order": branch.orders[i],
             "t0": branch.ts[i],
-            "y0": named(jax.tree.map(lambda x, i=i: x[i], branch.ys)),
+            "y0": by_name(jax.tree.map(lambda x, i=i: x[i], branch.ys)),
             "multipliers": _pairs(branch.multipliers[i]),
             "itinerary": branch.itineraries[i],
             "stable": bool(branch.stable[i]),
@@ -266,7 +266,7 @@ def _special(special: OrbitBifurcation) -> dict[str, Any]:
         "value": special.value,
         "period": special.period,
         "t": special.t,
-        "y": named(special.y),
+        "y": by_name(special.y),
         "discontinuous": bool(special.discontinuous),
         "criticality": special.criticality,
         "evidence": special.evidence,

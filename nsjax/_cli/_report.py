@@ -184,7 +184,7 @@ def _parameters(system: System) -> dict[str, Any]:
     }
 
 
-def named(y: Y) -> dict[str, Any]:
+def by_name(y: Y) -> dict[str, Any]:
     """The leaves of a state by name."""
     leaves = jax.tree_util.tree_flatten_with_path(y)[0]
     return {jax.tree_util.keystr(path, simple=True, separator=".") or "y": leaf for path, leaf in leaves}
@@ -205,8 +205,8 @@ def _events(system: System, events: Events) -> list[dict[str, Any]]:
             "switch": e.switch,
             "from": e.mode_before,
             "to": e.mode_after,
-            "y": named(e.y_before),
-            "y_after": named(e.y_after),
+            "y": by_name(e.y_before),
+            "y_after": by_name(e.y_after),
             "saltation": matrices[i],
             "transversality": e.transversality,
         }
@@ -219,7 +219,7 @@ def orbit_record(orbit: Orbit) -> dict[str, Any]:
     return {
         "period": orbit.period,
         "t0": orbit.t0,
-        "y0": named(orbit.y0),
+        "y0": by_name(orbit.y0),
         "itinerary": list(orbit.itinerary),
         "events": _events(orbit.system, orbit.events),
         "monodromy": orbit.monodromy,
@@ -234,7 +234,7 @@ def simulation_record(sol: Solution) -> dict[str, Any]:
     return {
         "t0": sol.t0,
         "t1": sol.t1,
-        "y1": named(sol.y1),
+        "y1": by_name(sol.y1),
         "mode1": dict(zip(sol.events.names, jnp.asarray(sol.mode1).tolist())),
         "events": _events(sol.system, sol.events),
         "result": "successful" if sol.result == RESULTS.successful else advice(sol.result),

@@ -39,7 +39,7 @@ def _modes(system: System, mode: Any) -> tuple[Int[Array, ""], ...]:
     return tuple(jnp.asarray(m, jnp.int32) for m in mode)
 
 
-def fired(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
+def event_function(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
     """The guard of switch k that is at zero: its surface, or while sliding the bound that λ has reached."""
     surface = model.switches[k].surface(model, k, t, y, state)
     if k not in model.holdable:
@@ -49,7 +49,7 @@ def fired(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> S
     return jnp.where(model.held(k, state.mode[k]), left, surface)
 
 
-def landed(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState, after: tuple) -> tuple[Y, Scalar]:
+def after_event(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState, after: tuple) -> tuple[Y, Scalar]:
     """The state after an event of switch k at `t`, `y`, and how long the impacts that lead to rest take together."""
     none = jnp.zeros_like(t)
     if not isinstance(model.switches[k], impact):
@@ -93,12 +93,12 @@ def _jump(model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after: 
         return jfu.ravel_pytree(y)[0]
 
     state = model.state_at(t, y, before)
-    h_t, n = jax.jacfwd(lambda t, x: fired(model, k, t, unravel(x), state), argnums=(0, 1))(t, flat)
+    h_t, n = jax.jacfwd(lambda t, x: event_function(model, k, t, unravel(x), state), argnums=(0, 1))(t, flat)
     f_before = ravel(model.flow(t, y, state))
     onto = jnp.eye(flat.size, dtype=flat.dtype)
 
     def hit(t: Scalar, x: Array) -> tuple[Array, Scalar]:
-        out, rest = landed(model, k, t, unravel(x), state, after)
+        out, rest = after_event(model, k, t, unravel(x), state, after)
         return ravel(out), rest
 
     (r_t, dr), (rest_t, drest) = jax.jacfwd(hit, argnums=(0, 1))(t, flat)

@@ -347,10 +347,10 @@ def solve(
         if known(dt0) and not np.all(np.asarray(dt0) > 0):
             raise ValueError(f"Argument `dt0` must be a time above zero, whatever the direction, but got {dt0}.")
         dt0 = jnp.abs(jnp.asarray(dt0, t0.dtype))
-    told = throw and known((system, t0, t1, y0, given, integrator, saveat, dt0))
-    within = throw and not told  # raised by the compiled program itself
+    concrete = throw and known((system, t0, t1, y0, given, integrator, saveat, dt0))
+    within = throw and not concrete  # raised by the compiled program itself
     sol = _run(system, t0, t1, y0, _Options(given, integrator, saveat, dt0, within, progress_meter))
-    if not told:
+    if not concrete:
         return sol
     if not known(sol.result):  # numbers that are known, within a function that is being compiled
         return raise_if(~is_okay(sol.result), sol.result, sol)

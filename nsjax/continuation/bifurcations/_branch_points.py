@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ...orbits.segments._equations import OrbitCurve, row_sizes
-from ...orbits.segments._itinerary import Course
+from ...orbits.segments._itinerary import OrbitItinerary
 from ..orbits._test_functions import Test
 from ..orbits._tracer import of_circle, of_corners, OrbitPoint
 from ._surface import AbstractBifurcationTracer, DELTA, interval_tests, Place, seen_at
@@ -27,9 +27,9 @@ EXACT = 1e-11
 
 
 @eqx.filter_jit
-def _equations(curve: OrbitCurve, course: Course, u: Array, origin: Array) -> tuple[Array, Array]:
+def _equations(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, origin: Array) -> tuple[Array, Array]:
     def residual(u: Array) -> tuple[Array, Array]:
-        f = curve.residual(u, course, origin)[0]
+        f = curve.residual(u, itinerary, origin)[0]
         return f, f
 
     df, f = jax.jacfwd(residual, has_aux=True)(u)
@@ -41,25 +41,25 @@ class _Frame:
     """The three coordinates around a point, and the regular equations."""
 
     curve: OrbitCurve
-    course: Course
+    itinerary: OrbitItinerary
     u: np.ndarray
     sizes: np.ndarray  # of the equations
     missing: np.ndarray  # w
     plane: np.ndarray  # (3, N)
 
     @classmethod
-    def at(cls, curve: OrbitCurve, course: Course, u: np.ndarray) -> "_Frame":
-        _, df = map(np.asarray, _equations(curve, course, u, u))
+    def at(cls, curve: OrbitCurve, itinerary: OrbitItinerary, u: np.ndarray) -> "_Frame":
+        _, df = map(np.asarray, _equations(curve, itinerary, u, u))
         sizes = np.asarray(row_sizes(df))
         left, _, right = np.linalg.svd(df / sizes[:, None])
-        return cls(curve, course, u, sizes, left[:, -1], right[-3:])
+        return cls(curve, itinerary, u, sizes, left[:, -1], right[-3:])
 
     def solved(self, s: np.ndarray, guess: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
         """The unknowns, β, and its gradient, at these coordinates."""
         n, u, beta = len(guess), guess, 0.0
         zeros = np.zeros((3, 1))
         for _ in range(12):
-            f, df = map(np.asarray, _equations(self.curve, self.course, u, self.u))
+            f, df = map(np.asarray, _equations(self.curve, self.itinerary, u, self.u))
             rest = np.concatenate([f / self.sizes + beta * self.missing, self.plane @ (u - self.u) - s])
             whole = np.block([[df / self.sizes[:, None], self.missing[:, None]], [self.plane, zeros]])
             inverse = np.linalg.inv(whole)
@@ -105,11 +105,11 @@ class BranchLocus(AbstractBifurcationTracer):
     """The curve of the branch points, followed on no surface of regular points."""
 
     def place(self, spot: OrbitPoint, along: np.ndarray | None = None, heading: np.ndarray | None = None) -> Place:
-        frame = _Frame.at(self.curve, spot.course, spot.look.u)
+        frame = _Frame.at(self.curve, spot.itinerary, spot.look.u)
         if along is None:  # where the branch was is known by interpolation
             u = frame.critical()
-            spot = self._seen(spot.course, u, frame)
-            frame = _Frame.at(self.curve, spot.course, u)
+            spot = self._seen(spot.itinerary, u, frame)
+            frame = _Frame.at(self.curve, spot.itinerary, u)
         values, vectors = np.linalg.eigh(frame.curvature(np.zeros(3), frame.u))
         flat, *others = np.argsort(np.abs(values))
         if abs(values[flat]) > ISOLATED * abs(values[others]).min():
@@ -121,16 +121,16 @@ class BranchLocus(AbstractBifurcationTracer):
         return Place(spot, tangent, vectors[:, others[0]] @ frame.plane, slope, tangent[-2:])
 
     def step(self, place: Place, length: float) -> OrbitPoint:
-        frame = _Frame.at(self.curve, place.spot.course, place.spot.look.u)
+        frame = _Frame.at(self.curve, place.spot.itinerary, place.spot.look.u)
         ahead = frame.plane @ place.along
-        return self._seen(place.spot.course, frame.critical(ahead / np.linalg.norm(ahead), length), frame)
+        return self._seen(place.spot.itinerary, frame.critical(ahead / np.linalg.norm(ahead), length), frame)
 
-    def _seen(self, course: Course, u: np.ndarray, frame: _Frame) -> OrbitPoint:
-        spot = seen_at(self.curve, course, u, frame.plane[:2])
+    def _seen(self, itinerary: OrbitItinerary, u: np.ndarray, frame: _Frame) -> OrbitPoint:
+        spot = seen_at(self.curve, itinerary, u, frame.plane[:2])
         # At a point where the equations are singular there is no tangent plane.
         return dataclasses.replace(spot, look=spot.look._replace(tangent=frame.plane[:2]))
 
     def watched(self, place: Place) -> dict[Test, float]:
         spot = place.spot
         out: dict[Test, Any] = interval_tests(spot) | of_corners(self.curve, spot) | of_circle(self.curve, spot)
-        return self.told(out)
+        return self.counting(out)

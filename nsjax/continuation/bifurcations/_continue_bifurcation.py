@@ -19,8 +19,8 @@ from ..orbits._test_functions import CORNERS, Test
 from ..orbits._tracer import midpoint, OrbitPoint
 from ..orbits.corners._corner import is_impact
 from ._branch_points import BranchLocus
-from ._surface import BifurcationTracer, CUSP, lifted, Place, RESONANCES, surfaces_of, touches
-from ._tracer import Codim2Point, FAILED, LAST, trace, Trail
+from ._surface import BifurcationTracer, CUSP, lift, Place, RESONANCES, surfaces_of, touches
+from ._tracer import Codim2Point, FAILED, LAST, Trace, trace
 
 
 @shown
@@ -149,10 +149,10 @@ def continue_bifurcation(
     as the zero of an equation ("end"), or that does not lie on a curve.
     """
     origin, path, low, high = _checked(special, parameter, interval, first)
-    surface, spot, test = lifted(origin, path, low, high)
+    surface, spot, test = lift(origin, path, low, high)
     locus, place = _locus(special, parameter, surface, spot, test)
     ahead = trace(locus, place, max_step, max_points)
-    back = Trail([place.spot]) if ahead.closed else trace(locus, place.turned, max_step, max_points)
+    back = Trace([place.spot]) if ahead.closed else trace(locus, place.turned, max_step, max_points)
     names = (special.parameter, parameter)
     kind, surfaces = _kind(surface, spot, special, test)
     spots = back.spots[:0:-1] + ahead.spots
@@ -160,7 +160,7 @@ def continue_bifurcation(
     met = [(shift - i, m) for i, m in back.met[::-1]] + [(shift + i, m) for i, m in ahead.met]
     ends = [CLOSED if ahead.closed else _end(surface, t, names) for t in (back, ahead)]
     known = [(i, m) for i, m in met if m.test.kind not in ("low", "high")]
-    bases = [midpoint(surface, s, s.course.rows) for s in spots]
+    bases = [midpoint(surface, s, s.itinerary.rows) for s in spots]
     unravel = jfu.ravel_pytree(surface.like)[1]
     silent = {test.kind for test in locus.silent}
 
@@ -245,7 +245,7 @@ def _locus(
             f"Argument `special` must lie on a curve of such points in {special.parameter} and {parameter}, but beside "
             f"this {special.name} none was found: {why}."
         ) from why
-    return locus.heard([place, *near]), place
+    return locus.with_silent([place, *near]), place
 
 
 def _kind(curve: OrbitCurve, spot: OrbitPoint, special: OrbitBifurcation, test: Test) -> tuple[str, tuple[str, ...]]:
@@ -258,7 +258,7 @@ def _touching(curve: OrbitCurve, spot: OrbitPoint, test: Test) -> str:
     """How the orbit meets a surface at a corner."""
     if test.kind == "rate":
         return "grazing" if is_impact(curve, spot, test.row) else "tangency"
-    if test.kind == "duration" and touches(spot.course, test.row):
+    if test.kind == "duration" and touches(spot.itinerary, test.row):
         return "grazing"
     return "grazing" if test.kind in ("guard", "grazing") else "corner"
 
@@ -283,11 +283,11 @@ def _name(curve: OrbitCurve, kind: str, met: Codim2Point) -> str:
     return f"{kind}-{other}"
 
 
-def _end(curve: OrbitCurve, trail: Trail, names: tuple[str, str]) -> str:
-    met = trail.end
+def _end(curve: OrbitCurve, traced: Trace, names: tuple[str, str]) -> str:
+    met = traced.end
     if met is None:
-        at = ", ".join(f"{n} = {v:.6g}" for n, v in zip(names, trail.spots[-1].look.parameter))
-        return f"{trail.why}, at {at}"
+        at = ", ".join(f"{n} = {v:.6g}" for n, v in zip(names, traced.spots[-1].look.parameter))
+        return f"{traced.why}, at {at}"
     if met.test.kind in ("low", "high"):
         return f"{names[met.test.row]} = {met.spot.look.parameter[met.test.row]:.6g}"
     if met.test.kind in LAST[:5]:

@@ -1,5 +1,5 @@
-"""The surface on which the periodic orbits of one course lie when two parameters vary, and curves of special points on
-it: where a test function is zero."""
+"""The surface of periodic orbits of one itinerary over two parameters, and curves of special points on it: where a test
+function is zero."""
 
 import abc
 import dataclasses
@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from ...derivatives._floquet import trivial
 from ...orbits.segments._equations import linearised, OrbitCurve
-from ...orbits.segments._itinerary import capacity_for, Course, EVENT, GRAZING, Start
+from ...orbits.segments._itinerary import capacity_for, EVENT, GRAZING, OrbitItinerary, Start
 from ...orbits.segments._point import along_segment, correct, Plane, PointData, zeros_at_begin
 from ...system._parameter import get_parameter
 from ..orbits._bifurcation import Origin
@@ -49,7 +49,7 @@ class Place:
         return dataclasses.replace(self, along=-self.along)
 
 
-def lifted(
+def lift(
     origin: Origin, path: tuple[str, ...], low: np.ndarray, high: np.ndarray
 ) -> tuple[OrbitCurve, OrbitPoint, Test]:
     """A special point of a branch as one of the surface over its parameter and another one, in these intervals."""
@@ -63,30 +63,30 @@ def lifted(
     # The tangent plane is spanned by that of the branch, and by a direction in which the other parameter moves.
     border = np.stack([tangent / np.linalg.norm(tangent), np.eye(len(u))[-1]])
     newton = test.kind != "branch"  # where the equations are singular it is as exact as it gets
-    found = correct(surface, spot.course, Plane(u, border), newton=newton)
-    return surface, spot_of(surface, found, spot.course), test
+    found = correct(surface, spot.itinerary, Plane(u, border), newton=newton)
+    return surface, spot_of(surface, found, spot.itinerary), test
 
 
-def touches(course: Course, row: int) -> bool:
+def touches(itinerary: OrbitItinerary, row: int) -> bool:
     """Whether without a segment the orbit would only touch the surface at which it begins."""
-    before, after = (row - 1) % int(course.num), (row + 1) % int(course.num)
-    same = np.array_equal(course.mode[before], course.mode[after])
-    return same and before != row and course.ends[before] == course.ends[row] == EVENT
+    before, after = (row - 1) % int(itinerary.num), (row + 1) % int(itinerary.num)
+    same = np.array_equal(itinerary.mode[before], itinerary.mode[after])
+    return same and before != row and itinerary.ends[before] == itinerary.ends[row] == EVENT
 
 
 def untouched(origin: Origin) -> Origin:
     """Where segments vanish because the orbit only just touches a surface, the orbit without them, cut where it
     touches: with two such segments, as symmetric orbits have them, the equations are singular, without they are not."""
     test, spot, curve = origin
-    course, look, n = spot.course, spot.look, int(spot.course.num)
+    itinerary, look, n = spot.itinerary, spot.look, int(spot.itinerary.num)
     length = (look.end - look.begin) / float(curve.time)
-    if test.kind != "duration" or not touches(course, test.row):
+    if test.kind != "duration" or not touches(itinerary, test.row):
         return origin
-    gone = [i for i in range(n) if touches(course, i) and abs(length[i]) < 1e-5]
+    gone = [i for i in range(n) if touches(itinerary, i) and abs(length[i]) < 1e-5]
     kept = [i for i in range(n) if i not in gone]
-    ends, xs = np.array(course.ends), np.array(look.x)
+    ends, xs = np.array(itinerary.ends), np.array(look.x)
     ends[[(i - 1) % n for i in gone]] = GRAZING
-    shorter = course._replace(ends=ends).take(kept, capacity_for(len(kept)))
+    shorter = itinerary._replace(ends=ends).take(kept, capacity_for(len(kept)))
     start = Start(shorter, look.begin[kept], look.end[kept], xs[kept])
     u = curve.pack(start, spot.parameter)
     border = np.linalg.svd(np.asarray(linearised(curve, shorter, u)))[2][-1]
@@ -121,10 +121,10 @@ class AbstractBifurcationTracer(abc.ABC):
     def watched(self, place: Place) -> dict[Test, float]:
         """What may vanish at a point of the curve besides its own test function."""
 
-    def told(self, tests: dict[Test, float]) -> dict[Test, float]:
+    def counting(self, tests: dict[Test, float]) -> dict[Test, float]:
         return {t: v for t, v in tests.items() if t != self.test and t not in self.silent and np.isfinite(v)}
 
-    def heard(self, places: list[Place]) -> Self:
+    def with_silent(self, places: list[Place]) -> Self:
         """Without what is zero at all of these points of it, as it is by symmetry, or where it belongs to the test."""
         rows = [self.watched(place) for place in places]
         names = {t for row in rows for t in row}
@@ -140,17 +140,17 @@ class BifurcationTracer(AbstractBifurcationTracer):
 
     def at(self, spot: OrbitPoint, s: np.ndarray, guess: np.ndarray | None = None) -> OrbitPoint:
         """The point of the surface at these distances along the frame of the tangent plane at another."""
-        found = correct(self.curve, spot.course, Plane(spot.look.u, spot.look.tangent, s), guess)
+        found = correct(self.curve, spot.itinerary, Plane(spot.look.u, spot.look.tangent, s), guess)
         if not bool(found.good):
             raise ArithmeticError("there is no orbit")
-        return spot_of(self.curve, found, spot.course)
+        return spot_of(self.curve, found, spot.itinerary)
 
     def value(self, spot: OrbitPoint) -> float:
         test, look = self.test, spot.look
         if test.kind == "fold":
             return projection(spot)
         if test.kind == "grazing":
-            return float(look.ends[test.row] / self.curve.guard_sizes[spot.course.slot[test.row]])
+            return float(look.ends[test.row] / self.curve.guard_sizes[spot.itinerary.slot[test.row]])
         return (of_corners if test.kind in CORNERS else of_circle)(self.curve, spot)[test]
 
     def place(self, spot: OrbitPoint, along: np.ndarray | None = None, heading: np.ndarray | None = None) -> Place:
@@ -204,39 +204,41 @@ class BifurcationTracer(AbstractBifurcationTracer):
             rho = spot.multipliers[~(trivial(spot.multipliers) & self.curve.autonomous)]
             pairs = [(abs(a * b - 1), (a + b).real / 2) for i, a in enumerate(rho) for b in rho[:i]]
             out |= {name: min(pairs)[1] + off for name, off in RESONANCES.items()}
-        return self.told(out)
+        return self.counting(out)
 
 
 def cleared(curve: OrbitCurve, spot: OrbitPoint) -> OrbitPoint:
     """With the least values of guards beside cuts at which they are zero, and least, divided by that double zero."""
-    course, look, n = spot.course, spot.look, int(spot.course.num)
-    cuts = np.flatnonzero(course.ends[:n] == GRAZING).tolist()
+    itinerary, look, n = spot.itinerary, spot.look, int(spot.itinerary.num)
+    cuts = np.flatnonzero(itinerary.ends[:n] == GRAZING).tolist()
     if not cuts:
         return spot
-    zeros = np.asarray(zeros_at_begin(curve, course))
+    zeros = np.asarray(zeros_at_begin(curve, itinerary))
     least, where, spots = np.array(look.least), np.array(look.where), np.array(look.spots)
     for cut in cuts:
-        slot = int(course.slot[cut])
+        slot = int(itinerary.slot[cut])
         for row in {cut, (cut + 1) % n}:
             before = row - 1 if row else n - 1
             orders = np.zeros((2, least.shape[1]))
-            orders[0, slot] = 2 if (course.ends[before], course.slot[before]) == (GRAZING, slot) else zeros[row, slot]
+            orders[0, slot] = (
+                2 if (itinerary.ends[before], itinerary.slot[before]) == (GRAZING, slot) else zeros[row, slot]
+            )
             ends = {GRAZING: 2, EVENT: 1}
-            orders[1, slot] = ends.get(int(course.ends[row]), 0) if course.slot[row] == slot else 0
-            found = jax.device_get(_guards_along(curve, look, course, np.asarray(row), orders))
+            orders[1, slot] = ends.get(int(itinerary.ends[row]), 0) if itinerary.slot[row] == slot else 0
+            found = jax.device_get(_guards_along(curve, look, itinerary, np.asarray(row), orders))
             least[row, slot], where[row, slot], spots[row, slot] = (part[slot] for part in found)
     return dataclasses.replace(spot, look=look._replace(least=least, where=where, spots=spots))
 
 
 @eqx.filter_jit
 def _guards_along(
-    curve: OrbitCurve, look: PointData, course: Course, row: Array, orders: Array
+    curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary, row: Array, orders: Array
 ) -> tuple[Array, Array, Array]:
     """The least values of the guards along a segment, divided by zeros of these orders at its ends; where; and the
     states there."""
     n = len(curve.sizes)
     orders = jnp.concatenate([jnp.zeros((2, 2 * n), orders.dtype), orders], axis=1)
-    columns = (look.begin, look.end, look.x, course.mode, course.part)
+    columns = (look.begin, look.end, look.x, itinerary.mode, itinerary.part)
     segment = tuple(jnp.asarray(column)[row] for column in columns)
     found = along_segment(curve, jnp.asarray(look.parameter), segment, orders, turns=False)
     return found.least[2 * n :], found.share[2 * n :], found.x[2 * n :]
@@ -255,15 +257,15 @@ def projection(spot: OrbitPoint) -> float:
 
 def surfaces_of(curve: OrbitCurve, spot: OrbitPoint, test: Test) -> tuple[str, ...]:
     """The switches whose surfaces are touched where a test function of `CORNERS` vanishes."""
-    course, n = spot.course, int(spot.course.num)
-    slots = [test.slot] if test.kind == "guard" else [int(course.slot[test.row])]
-    if test.kind == "duration" and course.ends[test.row - 1 if test.row else n - 1] == EVENT:
-        slots.insert(0, int(course.slot[test.row - 1 if test.row else n - 1]))
+    itinerary, n = spot.itinerary, int(spot.itinerary.num)
+    slots = [test.slot] if test.kind == "guard" else [int(itinerary.slot[test.row])]
+    if test.kind == "duration" and itinerary.ends[test.row - 1 if test.row else n - 1] == EVENT:
+        slots.insert(0, int(itinerary.slot[test.row - 1 if test.row else n - 1]))
     names = [curve.model.switches[curve.model.slots[slot].switch].name for slot in slots]
     return tuple(dict.fromkeys(names))
 
 
-def seen_at(curve: OrbitCurve, course: Course, u: np.ndarray, border: np.ndarray) -> OrbitPoint:
+def seen_at(curve: OrbitCurve, itinerary: OrbitItinerary, u: np.ndarray, border: np.ndarray) -> OrbitPoint:
     """What is seen of a point that is known to be one of the surface."""
-    found = correct(curve, course, Plane(u, border), newton=False)
-    return spot_of(curve, jax.device_get(found), course)
+    found = correct(curve, itinerary, Plane(u, border), newton=False)
+    return spot_of(curve, jax.device_get(found), itinerary)

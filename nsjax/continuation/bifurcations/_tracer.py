@@ -10,7 +10,7 @@ from ..._numerics._bracket import bracketed
 from ...orbits.segments._equations import linearised
 from ..orbits._test_functions import BRANCH, CORNERS, Test
 from ..orbits._tracer import FIRST, OrbitPoint, SHORTEST, TURN, TURNED
-from ..orbits.corners._grazing import cut_course
+from ..orbits.corners._grazing import cut_itinerary
 from ._surface import AbstractBifurcationTracer, BifurcationTracer, cleared, CUSP, DELTA, Place, RESONANCES, seen_at
 
 
@@ -32,7 +32,7 @@ class Codim2Point(NamedTuple):
 
 
 @dataclasses.dataclass
-class Trail:
+class Trace:
     """Points one after the other, and what is met at some of them; `end` is the last if it ends the curve."""
 
     spots: list[OrbitPoint]
@@ -42,9 +42,9 @@ class Trail:
     closed: bool = False
 
 
-def trace(locus: AbstractBifurcationTracer, place: Place, max_step: float, max_points: int) -> Trail:
+def trace(locus: AbstractBifurcationTracer, place: Place, max_step: float, max_points: int) -> Trace:
     """Follows the curve from a point in the direction that it has there."""
-    out, begin, length, steps = Trail([place.spot]), place, FIRST, 0
+    out, begin, length, steps = Trace([place.spot]), place, FIRST, 0
     while len(out.spots) < max_points:
         try:
             after = locus.place(locus.step(place, length), place.along, place.heading)
@@ -102,7 +102,7 @@ def _met(locus: AbstractBifurcationTracer, place: Place, after: Place, length: f
         if test.kind in (*CORNERS, "low", "high") and new[test] > 0:
             continue  # it comes from where it could not be: a start on the point itself
         found.append(_located(locus, place, after, length, test))
-    found = [met for met in found if _told(locus, met)]
+    found = [met for met in found if _bifurcates(locus, met)]
     rank = {kind: i for i, kind in enumerate(RANK)}
     found.sort(key=lambda met: met.s)
     out: list[Codim2Point] = []
@@ -116,7 +116,7 @@ def _met(locus: AbstractBifurcationTracer, place: Place, after: Place, length: f
     return out
 
 
-def _told(locus: AbstractBifurcationTracer, met: Codim2Point) -> bool:
+def _bifurcates(locus: AbstractBifurcationTracer, met: Codim2Point) -> bool:
     """Two real multipliers with the product 1 bifurcate only where both are 1, or -1."""
     if met.test.kind != "Neimark-Sacker":
         return True
@@ -186,7 +186,7 @@ def _interpolated(
     root = min(real, key=abs)
     weights = np.linalg.solve(powers.T, root ** np.arange(len(shares)))
     u = weights @ np.stack([here.look.u for here in spots])
-    spot = seen_at(locus.curve, place.spot.course, u, place.spot.look.tangent)
+    spot = seen_at(locus.curve, place.spot.itinerary, u, place.spot.look.tangent)
     # So are the multipliers there a limit, of saltation matrices that are none.
     monodromy = np.tensordot(weights, np.stack([here.monodromy for here in spots]), axes=1)
     rho = np.linalg.eigvals(monodromy)
@@ -197,16 +197,16 @@ def _interpolated(
 
 def _cut(locus: BifurcationTracer, spot: OrbitPoint, test: Test) -> OrbitPoint | None:
     """The point of the curve at which the least value of a guard is zero exactly: the orbit cut there."""
-    start, rows = cut_course(locus.curve, cleared(locus.curve, spot), [(test.row, test.slot)])
+    start, rows = cut_itinerary(locus.curve, cleared(locus.curve, spot), [(test.row, test.slot)])
     row = rows[test.row, test.slot]
     own = locus.test
     if own.kind in (*CORNERS, "grazing") and row <= own.row:
         own = own._replace(row=own.row + 1)
     u = locus.curve.pack(start, spot.look.parameter)
-    border = np.linalg.svd(np.asarray(linearised(locus.curve, start.course, u)))[2][-2:]
+    border = np.linalg.svd(np.asarray(linearised(locus.curve, start.itinerary, u)))[2][-2:]
     try:
         first, second = (dataclasses.replace(locus, test=t) for t in (own, Test("grazing", row)))
-        rough = seen_at(locus.curve, start.course, u, border)
+        rough = seen_at(locus.curve, start.itinerary, u, border)
         return meet(first, second, first.at(rough, np.zeros(2)))
     except FAILED:
         return None

@@ -140,7 +140,7 @@ def _plain(x: float) -> str:
     return f"{0.0 if abs(x) < 1e-13 else x:.10g}"
 
 
-def counted(halves: Sequence[HalfBranch]) -> tuple[str, str | None]:
+def kind_by_count(halves: Sequence[HalfBranch]) -> tuple[str, str | None]:
     """The kind that the number of equilibria suggests, and its criticality."""
     below, above = ([half for half in halves if half.side == side] for side in (-1, 1))
     numbers = len(below), len(above)
@@ -173,7 +173,7 @@ def odd_one(three: Sequence[HalfBranch]) -> HalfBranch | None:
     return None
 
 
-def classified(by_count: str, by_crossing: tuple[str, ...] | None) -> tuple[str, str]:
+def classify(by_count: str, by_crossing: tuple[str, ...] | None) -> tuple[str, str]:
     """The kind, and what supports it. Definition 5.1 says what a static bifurcation is, and so the count decides where
     the two disagree: an eigenvalue may pass zero twice, and nothing happen (section 5.8)."""
     static = by_count if by_count != "none" else ""

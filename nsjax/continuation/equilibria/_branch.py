@@ -60,7 +60,7 @@ Branch.saved = table(Branch, Bifurcation, HalfBranch, EigenvalueCrossing)
 
 
 @dataclasses.dataclass
-class Strand:
+class BranchSegment:
     """Points one after the other, and the special ones among them, while they are found."""
 
     records: list[Record] = dataclasses.field(default_factory=list)
@@ -75,39 +75,41 @@ class Strand:
     def note(self, bifurcation: Bifurcation) -> None:
         self.special.append((len(self.records) - 1, bifurcation))
 
-    def reversed(self) -> "Strand":
+    def reversed(self) -> "BranchSegment":
         last = len(self.records) - 1
-        return Strand(self.records[::-1], self.modes[::-1], [(last - i, b) for i, b in self.special[::-1]], self.end)
+        return BranchSegment(
+            self.records[::-1], self.modes[::-1], [(last - i, b) for i, b in self.special[::-1]], self.end
+        )
 
     def closed(self) -> bool:
         return self.end == CLOSED
 
 
-def branch_of(system: System, parameter: str, back: Strand, ahead: Strand) -> Branch:
-    """Two strands that set out from one point as one branch: upwards, if there is a choice."""
+def branch_of(system: System, parameter: str, back: BranchSegment, ahead: BranchSegment) -> Branch:
+    """Two segments that set out from one point as one branch: upwards, if there is a choice."""
     ends = (back.end, ahead.end)
     back = back.reversed()
     # The common point is there once, or, where eigenvalues jump, from both sides.
     corner = bool(back.special) and back.special[-1][0] == len(back.records) - 1 and back.special[-1][1].discontinuous
     keep = len(back.records) - (0 if corner else 1)
-    strand = Strand(back.records[: max(keep, 0)] + ahead.records, back.modes[: max(keep, 0)] + ahead.modes)
-    strand.special = [(i, b) for i, b in back.special if i < keep]
-    last = strand.special[-1][1] if corner and strand.special else None
-    strand.special += [(i + max(keep, 0), b) for i, b in ahead.special if b is not last or i > 0]
-    if float(strand.records[0].parameter) > float(strand.records[-1].parameter):
-        strand, ends = strand.reversed(), ends[::-1]
-    tree = jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *strand.records)
+    segment = BranchSegment(back.records[: max(keep, 0)] + ahead.records, back.modes[: max(keep, 0)] + ahead.modes)
+    segment.special = [(i, b) for i, b in back.special if i < keep]
+    last = segment.special[-1][1] if corner and segment.special else None
+    segment.special += [(i + max(keep, 0), b) for i, b in ahead.special if b is not last or i > 0]
+    if float(segment.records[0].parameter) > float(segment.records[-1].parameter):
+        segment, ends = segment.reversed(), ends[::-1]
+    tree = jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *segment.records)
     return Branch(
         system=system,
         parameter=parameter,
         values=tree.parameter,
         ys=tree.y,
-        modes=np.stack([mode[0] for mode in strand.modes]),
+        modes=np.stack([mode[0] for mode in segment.modes]),
         multipliers=tree.multipliers,
         eigenvalues=tree.eigenvalues,
         unstable=unstable_number(tree.eigenvalues),
         stable=tree.stable,
-        special=tuple(b for _, b in strand.special),
-        indices=tuple(i for i, _ in strand.special),
+        special=tuple(b for _, b in segment.special),
+        indices=tuple(i for i, _ in segment.special),
         ends=ends,
     )

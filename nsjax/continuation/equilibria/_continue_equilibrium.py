@@ -16,8 +16,8 @@ from ...equilibria._find_equilibrium import checked_equilibrium, find_equilibriu
 from ...system._model import SwitchedSystem
 from ...system._parameter import get_parameter, parameter_path
 from ...system._system import System
-from ._branch import Branch, branch_of, Strand
-from ._corner import active, directions, Half, matching, Node, node_at, start_at
+from ._branch import Branch, branch_of, BranchSegment
+from ._corner import active, Departure, directions, matching, Node, node_at, start_at
 from ._corrector import kept, linearised
 from ._equations import EquilibriumCurve, kinks
 from ._tracer import Tracer
@@ -167,7 +167,7 @@ class _Tree:
         first, *others = self.found
         return dataclasses.replace(first, others=tuple(others))
 
-    def keep(self, back: Strand, ahead: Strand) -> None:
+    def keep(self, back: BranchSegment, ahead: BranchSegment) -> None:
         self.found.append(branch_of(self.tracer.curve.model.system, self.tracer.name, back, ahead))
 
     def set_out(self, u: Any, mode: np.ndarray) -> None:
@@ -182,13 +182,13 @@ class _Tree:
             raise ValueError(ALONE)
         tangent = jnp.asarray(max(tangents, key=lambda d: d[-1]))  # upwards first
         self.tracer.begin = (u, tangent, mode)
-        strand = Strand()
-        strand.add(kept(curve, u, jnp.asarray(mode)), mode)
+        segment = BranchSegment()
+        segment.add(kept(curve, u, jnp.asarray(mode)), mode)
         special = start_at(curve, self.tracer.name, u, mode, tangent)
         if special is not None:
-            strand.note(special)
-        ahead = self.walk(strand, u, tangent, mode)
-        back = Strand(end="the start") if ahead.closed() else self.walk(Strand(), u, -tangent, mode)
+            segment.note(special)
+        ahead = self.walk(segment, u, tangent, mode)
+        back = BranchSegment(end="the start") if ahead.closed() else self.walk(BranchSegment(), u, -tangent, mode)
         self.tracer.begin = None
         self.keep(back, ahead)
 
@@ -199,60 +199,60 @@ class _Tree:
                     continue
                 ahead = self.leave(node, half)
                 partner = half.partner
-                back = Strand(end=self.named(node))
+                back = BranchSegment(end=self.label(node))
                 if partner is not None and not partner.used:
                     back = self.leave(node, partner)
                 self.keep(back, ahead)
 
-    def named(self, node: Node) -> str:
+    def label(self, node: Node) -> str:
         return f"{node.bifurcation.name} at {self.tracer.name} = {node.bifurcation.value:.6g}"
 
-    def leave(self, node: Node, half: Half) -> Strand:
+    def leave(self, node: Node, half: Departure) -> BranchSegment:
         half.used = True
-        strand = Strand()
-        self.depart(strand, half)
-        _note(strand, node)
-        return self.walk(strand, *_outset(half))
+        segment = BranchSegment()
+        self.depart(segment, half)
+        _note(segment, node)
+        return self.walk(segment, *_outset(half))
 
-    def depart(self, strand: Strand, half: Half) -> None:
+    def depart(self, segment: BranchSegment, half: Departure) -> None:
         record = kept(self.tracer.curve, half.u, jnp.asarray(half.mode))
         if not half.regular:  # an eigenvalue is zero there, whose sign would be that of rounding
             record = record._replace(eigenvalues=half.step.record.eigenvalues, stable=half.step.record.stable)
-        strand.add(record, half.mode)
+        segment.add(record, half.mode)
 
-    def walk(self, strand: Strand, u: Any, tangent: Any, mode: np.ndarray) -> Strand:
+    def walk(self, segment: BranchSegment, u: Any, tangent: Any, mode: np.ndarray) -> BranchSegment:
         """Along a branch, through corners and branch points, to its end."""
         curve = self.tracer.curve
-        if not strand.records:
-            strand.add(kept(curve, u, jnp.asarray(mode)), mode)
+        if not segment.records:
+            segment.add(kept(curve, u, jnp.asarray(mode)), mode)
         while True:
-            u, tangent = self.tracer.arc(strand, u, tangent, mode)
-            if strand.end:
-                return strand
+            u, tangent = self.tracer.arc(segment, u, tangent, mode)
+            if segment.end:
+                return segment
             node = next((node for node in self.nodes if node.is_at(curve, u)), None)
             if node is None:
                 node = node_at(curve, self.tracer.name, u, mode, tangent)
                 self.nodes.append(node)
-            _note(strand, node)
+            _note(segment, node)
             arrived = matching(node.halves, mode, -tangent)
             ahead = None if arrived is None else arrived.partner
             if arrived is not None:
                 arrived.used = True
             if ahead is None or ahead.used:
-                strand.end = self.named(node)
-                return strand
+                segment.end = self.label(node)
+                return segment
             ahead.used = True
             if node.bifurcation.discontinuous:
-                self.depart(strand, ahead)
+                self.depart(segment, ahead)
             u, tangent, mode = _outset(ahead)
 
 
-def _note(strand: Strand, node: Node) -> None:
+def _note(segment: BranchSegment, node: Node) -> None:
     """Unless it is a point like any other, as where the branch runs along a surface."""
     if node.bifurcation.kind != "none" or node.bifurcation.discontinuous:
-        strand.note(node.bifurcation)
+        segment.note(node.bifurcation)
 
 
-def _outset(half: Half) -> tuple[Any, Any, np.ndarray]:
+def _outset(half: Departure) -> tuple[Any, Any, np.ndarray]:
     """Where the equations are singular, a branch is entered by its first step."""
     return (half.u, half.tangent, half.mode) if half.regular else (half.step.u, half.step.tangent, half.mode)

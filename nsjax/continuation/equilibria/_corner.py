@@ -9,7 +9,7 @@ import numpy as np
 
 from ...setvalued._eigenvalue_crossings import eigenvalue_crossings
 from ...setvalued._pencil import EigenvalueCrossing
-from ._bifurcation import Bifurcation, classified, counted, HalfBranch, odd_one, unstable_number
+from ._bifurcation import Bifurcation, classify, HalfBranch, kind_by_count, odd_one, unstable_number
 from ._corrector import branching, kept, linearised, near, row_sizes, Step, step_along
 from ._equations import EquilibriumCurve, first_lyapunov_coefficient
 
@@ -23,7 +23,7 @@ MODES = 6561  # so many combinations of sides are tried
 
 
 @dataclasses.dataclass
-class Half:
+class Departure:
     """A half-branch, with what it takes to follow it."""
 
     u: Any
@@ -34,7 +34,7 @@ class Half:
     side: int
     unstable: int
     index: int
-    partner: "Half | None" = None
+    partner: "Departure | None" = None
     used: bool = False
 
 
@@ -43,7 +43,7 @@ class Node:
     """A point at which half-branches meet, those that go on into one another being partners."""
 
     u: Any
-    halves: list[Half]
+    halves: list[Departure]
     bifurcation: Bifurcation
 
     def is_at(self, curve: EquilibriumCurve, u: Any) -> bool:
@@ -87,7 +87,7 @@ def directions(curve: EquilibriumCurve, u: Any, mode: np.ndarray) -> tuple[list[
 
 def _half(
     curve: EquilibriumCurve, u: Any, mode: np.ndarray, tangent: Any, regular: bool, length: float = PROBE
-) -> Half | None:
+) -> Departure | None:
     """The half-branch in a direction, if there is one: if its first step stays on the right sides."""
     signs = curve.armed(mode)
     here = np.asarray(near(curve, u))
@@ -110,7 +110,7 @@ def _half(
     slopes = np.asarray(linearised(curve, step.u, mode_array)[1])[:, :-1]
     # Not the tangent itself: a field may have kinks that no switch tells of on this very surface.
     secant = (step.u - u) / jnp.linalg.norm(step.u - u)
-    return Half(
+    return Departure(
         u=u,
         tangent=secant,
         mode=mode,
@@ -135,7 +135,7 @@ def node_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, arrivi
             f"At {name} = {float(curve.parts(u)[2]):.12g} {len(surfaces)} surfaces meet, whose {len(modes)} "
             f"combinations of sides are more than the {MODES} that are tried."
         )
-    halves: list[Half] = []
+    halves: list[Departure] = []
     degenerate = False
     for other in modes:
         there = curve.entered(u, other)
@@ -161,7 +161,7 @@ def node_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, arrivi
     return Node(u, halves, bifurcation)
 
 
-def _left(curve: EquilibriumCurve, halves: list[Half]) -> set[str]:
+def _left(curve: EquilibriumCurve, halves: list[Departure]) -> set[str]:
     """The switches whose surfaces (or bounds) some half-branch leaves, instead of running along it."""
     names = [k.name for k in curve.model.switches]
     left = set()
@@ -171,24 +171,24 @@ def _left(curve: EquilibriumCurve, halves: list[Half]) -> set[str]:
     return left
 
 
-def _same(curve: EquilibriumCurve, a: Half, b: Half) -> bool:
+def _same(curve: EquilibriumCurve, a: Departure, b: Departure) -> bool:
     n = len(curve.parts(a.u)[0])
     where = np.r_[0:n, len(a.u) - 1]
     return bool(np.max(np.abs(np.asarray(a.step.u - b.step.u))[where]) < 1e-3 * PROBE)
 
 
-def matching(halves: list[Half], mode: np.ndarray, tangent: Any) -> Half | None:
+def matching(halves: list[Departure], mode: np.ndarray, tangent: Any) -> Departure | None:
     """That which points this way in this mode."""
     same = [half for half in halves if np.array_equal(half.mode[0], mode[0])]
     best = max(same, key=lambda half: float(half.tangent @ tangent), default=None)
     return best if best is not None and float(best.tangent @ tangent) > 0.99 else None
 
 
-def _partners(halves: list[Half]) -> tuple[Half, Half] | None:
+def _partners(halves: list[Departure]) -> tuple[Departure, Departure] | None:
     """Who goes on into whom; the first pair is the one whose eigenvalues tell most. What is on both sides of the point
     comes first, and changes its stability, as far as there is a choice; then the straightest."""
 
-    def rank(pair: tuple[Half, Half]) -> tuple:
+    def rank(pair: tuple[Departure, Departure]) -> tuple:
         a, b = pair
         through = a.side * b.side == -1
         middle = any(half is odd for half in pair for odd in odds)
@@ -213,8 +213,8 @@ def _described(
     curve: EquilibriumCurve,
     name: str,
     u: Any,
-    halves: list[Half],
-    first: tuple[Half, Half] | None,
+    halves: list[Departure],
+    first: tuple[Departure, Departure] | None,
     *,
     surfaces: tuple[str, ...] = (),
     continuous: bool = True,
@@ -222,13 +222,13 @@ def _described(
 ) -> Bifurcation:
     """`smooth`: what a smooth point is by its singular equations; where eigenvalues jump, their crossings tell."""
     public = [_public(curve, half) for half in halves]
-    by_count, criticality = counted(public)
+    by_count, criticality = kind_by_count(public)
     crossings: list[EigenvalueCrossing] = []
     places: list[dict[str, float]] = []
     by_crossing: tuple[str, ...] | None = None if surfaces else smooth
     if surfaces and continuous and len(halves) > 1:
         by_crossing, crossings, places = _crossed(curve, *_ordered(first or (halves[0], halves[1])))
-    kind, evidence = classified(by_count, by_crossing)
+    kind, evidence = classify(by_count, by_crossing)
     omegas = [c.eigenvalue.imag for c in crossings if c.kind == "pair" and c.direction]
     return Bifurcation(
         kind=kind,
@@ -286,7 +286,7 @@ def hopf_at(
     criticality = None if abs(coefficient) < 1e-9 else "supercritical" if coefficient < 0 else "subcritical"
     criticality = criticality if pairs == 1 else None
     by_crossing = ("Hopf",) * pairs
-    kind, evidence = classified(found.by_count, by_crossing)
+    kind, evidence = classify(found.by_count, by_crossing)
     known = dict(kind=kind, evidence=evidence, by_crossing=by_crossing, criticality=criticality)
     return dataclasses.replace(found, **known, period=float(2 * np.pi / omega))
 
@@ -302,7 +302,7 @@ def start_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, tange
     return None
 
 
-def _public(curve: EquilibriumCurve, half: Half) -> HalfBranch:
+def _public(curve: EquilibriumCurve, half: Departure) -> HalfBranch:
     move = np.asarray(half.tangent * curve.units)
     n = len(curve.parts(half.u)[0])
     y = jfu.ravel_pytree(curve.like)[1](jnp.asarray(move[:n]))
@@ -318,14 +318,14 @@ def _public(curve: EquilibriumCurve, half: Half) -> HalfBranch:
     )
 
 
-def _ordered(pair: tuple[Half, Half]) -> tuple[Half, Half]:
+def _ordered(pair: tuple[Departure, Departure]) -> tuple[Departure, Departure]:
     """From below to above; on one side of the point from that side of the surfaces where h < 0."""
     a, b = sorted(pair, key=lambda half: (half.side, tuple(half.mode[0])))
     return a, b
 
 
 def _crossed(
-    curve: EquilibriumCurve, a: Half, b: Half
+    curve: EquilibriumCurve, a: Departure, b: Departure
 ) -> tuple[tuple[str, ...], list[EigenvalueCrossing], list[dict[str, float]]]:
     """What the eigenvalues do on the way from one half-branch to the other, at the point itself."""
     modes = jnp.asarray(a.mode), jnp.asarray(b.mode)

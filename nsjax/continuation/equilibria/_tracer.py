@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._bifurcation import unstable_number
-from ._branch import CLOSED, Strand
+from ._branch import BranchSegment, CLOSED
 from ._corner import active, fold_at, hopf_at
 from ._corrector import (
     BRANCH,
@@ -59,18 +59,18 @@ class Tracer:
     def value(self, u: Any) -> float:
         return float(self.curve.parts(u)[2])
 
-    def arc(self, strand: Strand, u: Any, tangent: Any, mode: np.ndarray) -> tuple[Any, Any]:
-        """Adds points to `strand` up to one where other branches may meet, which is returned with the tangent there; or
-        to the end of the branch, of which `strand.end` then tells."""
+    def arc(self, segment: BranchSegment, u: Any, tangent: Any, mode: np.ndarray) -> tuple[Any, Any]:
+        """Adds points to `segment` up to one where other branches may meet, and returns it with the tangent there; or
+        to the end of the branch, which `segment.end` then names."""
         length, traced = FIRST, jnp.asarray(mode)
-        while len(strand.records) < self.max_points:
+        while len(segment.records) < self.max_points:
             step = step_along(self.curve, u, tangent, jnp.asarray(length), traced)
             turn = float(np.arccos(np.clip(float(tangent @ step.tangent), -1, 1))) if step.good else np.inf
             zeros = self.zeros(step, u, tangent, mode, length) if step.good else None
             if turn > 0.5 and zeros is not None:
                 # Beyond a surface the equations may have a kink that no switch tells of; up to it they are smooth.
                 zeros = zeros if zeros and zeros[-1].which >= GUARDS else None
-            if zeros == [] and length > UNSEEN and self.changed(strand.records[-1], step.record):
+            if zeros == [] and length > UNSEEN and self.changed(segment.records[-1], step.record):
                 zeros = None
             if zeros is None:
                 length /= 2
@@ -79,40 +79,40 @@ class Tracer:
                     if len(on):
                         # There is no way past the surface with this side's equations: one ends on it.
                         u = on_surface(self.curve, u, traced, jnp.asarray(on[0]))
-                        strand.add(kept(self.curve, u, traced), mode)
+                        segment.add(kept(self.curve, u, traced), mode)
                         return u, tangent
-                    strand.end = f"the last point that could be found, {self.name} = {self.value(u):.6g}"
+                    segment.end = f"the last point that could be found, {self.name} = {self.value(u):.6g}"
                     return u, tangent
                 continue
             for zero in zeros:
                 if zero.which not in (FOLD, PAIR, MARK):
-                    return self.stop(strand, zero, tangent, mode)
-                self.pass_by(strand, zero, mode, length)
-            if self.closes(u, step.u, mode, len(strand.records)):
-                strand.end = CLOSED
-                strand.add(strand.records[0], strand.modes[0])
+                    return self.stop(segment, zero, tangent, mode)
+                self.pass_by(segment, zero, mode, length)
+            if self.closes(u, step.u, mode, len(segment.records)):
+                segment.end = CLOSED
+                segment.add(segment.records[0], segment.modes[0])
                 return step.u, step.tangent
             u, tangent = step.u, step.tangent
-            strand.add(step.record, mode)
+            segment.add(step.record, mode)
             # No component changes by more than `max_step` of its unit, or of what it is if that is more.
             speed = float(jnp.max(jnp.abs(tangent) / jnp.maximum(1, jnp.abs(u))))
             length = min(self.max_step / speed, length * float(np.clip(TURN / max(turn, 1e-9), 0.5, 2)))
-        strand.end = f"max_points = {self.max_points}, {self.name} = {self.value(u):.6g}"
+        segment.end = f"max_points = {self.max_points}, {self.name} = {self.value(u):.6g}"
         return u, tangent
 
-    def stop(self, strand: Strand, zero: Zero, tangent: Any, mode: np.ndarray) -> tuple[Any, Any]:
+    def stop(self, segment: BranchSegment, zero: Zero, tangent: Any, mode: np.ndarray) -> tuple[Any, Any]:
         u, record = zero.place.u, kept(self.curve, zero.place.u, jnp.asarray(mode))
         if zero.which == BRANCH:
             point, good = branch_point(self.curve, u, jnp.asarray(mode))
             u = point if good and float(jnp.max(jnp.abs(point - u))) < 1e-5 else u
             # There an eigenvalue is zero, whose sign would be that of rounding.
-            before = strand.records[-1]
+            before = segment.records[-1]
             record = kept(self.curve, u, jnp.asarray(mode))
             record = record._replace(eigenvalues=before.eigenvalues, stable=before.stable)
         if zero.s > 0:
-            strand.add(record, mode)
+            segment.add(record, mode)
         if zero.which in (LOW, HIGH):
-            strand.end = f"{self.name} = {self.value(u):.6g}"
+            segment.end = f"{self.name} = {self.value(u):.6g}"
             if float(jnp.abs(u[-1] - self.curve.mark)) < 1e-9:
                 self.marks.append(self.curve.parts(u)[0])
         return u, tangent if zero.which == BRANCH else zero.place.tangent
@@ -125,7 +125,7 @@ class Tracer:
         )
         return clear and unstable_number(roots[0]) != unstable_number(roots[1])
 
-    def pass_by(self, strand: Strand, zero: Zero, mode: np.ndarray, length: float) -> None:
+    def pass_by(self, segment: BranchSegment, zero: Zero, mode: np.ndarray, length: float) -> None:
         u, tangent = zero.place.u, zero.place.tangent
         if zero.which == MARK:
             self.marks.append(self.curve.parts(u)[0])
@@ -133,8 +133,8 @@ class Tracer:
         described = fold_at if zero.which == FOLD else hopf_at
         bifurcation = described(self.curve, self.name, u, mode, tangent, length / 10)
         if bifurcation is not None:
-            strand.add(kept(self.curve, u, jnp.asarray(mode)), mode)
-            strand.note(bifurcation)
+            segment.add(kept(self.curve, u, jnp.asarray(mode)), mode)
+            segment.note(bifurcation)
 
     def closes(self, u: Any, end: Any, mode: np.ndarray, points: int) -> bool:
         if self.begin is None or points < 4 or not np.array_equal(mode, self.begin[2]):

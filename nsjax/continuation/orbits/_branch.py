@@ -121,7 +121,7 @@ OrbitBranch.saved = table(OrbitBranch, OrbitBifurcation, OrbitHalfBranch, Eigenv
 
 
 class Point(NamedTuple):
-    """A point of a strand, of how many periods of the forcing its orbit is, the user's measures of it, and whether the
+    """A point of a piece, of how many periods of the forcing its orbit is, the user's measures of it, and whether the
     system has such an orbit."""
 
     spot: OrbitPoint
@@ -131,25 +131,25 @@ class Point(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class OrbitStrand:
+class OrbitBranchSegment:
     """Points one after the other, and the special ones among them."""
 
     points: tuple[Point, ...] = ()
     special: tuple[tuple[int, OrbitBifurcation], ...] = ()
     end: str = "here, so far"
 
-    def then(self, point: Point) -> "OrbitStrand":
+    def then(self, point: Point) -> "OrbitBranchSegment":
         return dataclasses.replace(self, points=(*self.points, point))
 
-    def ending(self, point: Point) -> "OrbitStrand":
+    def ending(self, point: Point) -> "OrbitBranchSegment":
         """With another last point."""
         return dataclasses.replace(self, points=(*self.points[:-1], point))
 
-    def noting(self, bifurcation: OrbitBifurcation) -> "OrbitStrand":
+    def noting(self, bifurcation: OrbitBifurcation) -> "OrbitBranchSegment":
         """With the last point as a special one."""
         return dataclasses.replace(self, special=(*self.special, (len(self.points) - 1, bifurcation)))
 
-    def reversed(self) -> "OrbitStrand":
+    def reversed(self) -> "OrbitBranchSegment":
         values, last = [point.spot.parameter for point in self.points], len(self.points) - 1
 
         def index(i: int) -> int:
@@ -157,40 +157,45 @@ class OrbitStrand:
             twice = i < last and math.isclose(values[i + 1], values[i], rel_tol=1e-10)
             return last - i - 1 if twice else last - i
 
-        return OrbitStrand(self.points[::-1], tuple((index(i), b) for i, b in self.special[::-1]), self.end)
+        return OrbitBranchSegment(self.points[::-1], tuple((index(i), b) for i, b in self.special[::-1]), self.end)
 
 
 def orbit_branch(
-    curve: OrbitCurve, system: System, parameter: str, back: OrbitStrand, ahead: OrbitStrand, itinerary: Any
+    curve: OrbitCurve,
+    system: System,
+    parameter: str,
+    back: OrbitBranchSegment,
+    ahead: OrbitBranchSegment,
+    itinerary_text: Any,
 ) -> OrbitBranch:
-    """Two strands that set out from one point as one branch: upwards, if there is a choice; a virtual one, away from
+    """Two pieces that set out from one point as one branch: upwards, if there is a choice; a virtual one, away from
     where it begins."""
     ends = (back.end, ahead.end)
     first, keep = back.reversed(), len(back.points)
     common = bool(first.special and ahead.special) and first.special[-1][1] is ahead.special[0][1]
     if keep and ahead.points and not common:
         keep -= first.points[-1].spot.look.u is ahead.points[0].spot.look.u
-    strand = OrbitStrand(
+    piece = OrbitBranchSegment(
         first.points[:keep] + ahead.points,
         tuple((i, b) for i, b in first.special if i < keep)
         + tuple((i + keep, b) for i, b in ahead.special if not (common and i == 0)),
     )
-    start, stop = strand.points[0], strand.points[-1]
+    start, stop = piece.points[0], piece.points[-1]
     if start.admissible and start.spot.parameter > stop.spot.parameter:
-        strand, ends = strand.reversed(), ends[::-1]
-    spots = [point.spot for point in strand.points]
+        piece, ends = piece.reversed(), ends[::-1]
+    spots = [point.spot for point in piece.points]
 
     def column(rows: list[np.ndarray]) -> Any:
         return states_of(curve.like, np.stack(rows))
 
-    bases = [midpoint(curve, spot, spot.course.rows) for spot in spots]
+    bases = [midpoint(curve, spot, spot.itinerary.rows) for spot in spots]
     texts: dict[int, str] = {}
     return OrbitBranch(
         system=system,
         parameter=parameter,
         values=np.array([spot.parameter for spot in spots]),
         periods=np.array([float(spot.look.period) for spot in spots]),
-        orders=np.array([point.order for point in strand.points]),
+        orders=np.array([point.order for point in piece.points]),
         ts=np.array([t for t, _, _ in bases]),
         ys=column([x for _, x, _ in bases]),
         low=column([spot.look.low for spot in spots]),
@@ -198,22 +203,22 @@ def orbit_branch(
         mean=column([spot.look.mean for spot in spots]),
         multipliers=np.stack([np.asarray(spot.multipliers, complex) for spot in spots]),
         stable=np.array([spot.stable for spot in spots]),
-        admissible=np.array([point.admissible for point in strand.points]),
+        admissible=np.array([point.admissible for point in piece.points]),
         segments=tuple(segments_of(curve, spot, t) for spot, (t, _, _) in zip(spots, bases)),
-        itineraries=tuple(texts.setdefault(id(s.course), itinerary(curve, s.course)) for s in spots),
-        records={name: np.stack([point.record[name] for point in strand.points]) for name in strand.points[0].record},
-        special=tuple(b for _, b in strand.special),
-        indices=tuple(i for i, _ in strand.special),
+        itineraries=tuple(texts.setdefault(id(s.itinerary), itinerary_text(curve, s.itinerary)) for s in spots),
+        records={name: np.stack([point.record[name] for point in piece.points]) for name in piece.points[0].record},
+        special=tuple(b for _, b in piece.special),
+        indices=tuple(i for i, _ in piece.special),
         ends=ends,
     )
 
 
 def segments_of(curve: OrbitCurve, spot: OrbitPoint, t: float) -> tuple[Segment, ...]:
     """The segments of an orbit from a time within one of them on; that one comes first and last."""
-    look, course, model = spot.look, spot.course, curve.model
-    modes = [tuple(course.mode[i].tolist()) for i in course.rows]
-    lengths = [float(look.end[i] - look.begin[i]) for i in course.rows]
-    if course.ends[0] == TIME:
+    look, itinerary, model = spot.look, spot.itinerary, curve.model
+    modes = [tuple(itinerary.mode[i].tolist()) for i in itinerary.rows]
+    lengths = [float(look.end[i] - look.begin[i]) for i in itinerary.rows]
+    if itinerary.ends[0] == TIME:
         return (Segment(modes[0], lengths[0]),)
     middles = (look.begin + look.end)[: len(modes)] / 2
     first = int(np.argmin(np.abs(middles - t)))
@@ -221,8 +226,8 @@ def segments_of(curve: OrbitCurve, spot: OrbitPoint, t: float) -> tuple[Segment,
     for i in [*range(first, len(modes)), *range(first)]:
         if i != first:
             duration += lengths[i]
-        if course.ends[i] != GRAZING:  # a cut that changes nothing
-            switch = model.switches[model.slots[int(course.slot[i])].switch].name
-            out.append(Segment(modes[i], duration, switch, bool(course.ends[i] == REPELLING_EXIT)))
+        if itinerary.ends[i] != GRAZING:  # a cut that changes nothing
+            switch = model.switches[model.slots[int(itinerary.slot[i])].switch].name
+            out.append(Segment(modes[i], duration, switch, bool(itinerary.ends[i] == REPELLING_EXIT)))
             duration = 0.0
     return (*out, Segment(modes[first], duration + float(t - look.begin[first])))

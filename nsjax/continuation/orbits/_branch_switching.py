@@ -8,11 +8,11 @@ import numpy as np
 
 from ...maps._corner_normal_form import Cycle
 from ...orbits.segments._equations import linearised, OrbitCurve, state_at
-from ...orbits.segments._itinerary import capacity_for, Course, Start, TIME
+from ...orbits.segments._itinerary import capacity_for, OrbitItinerary, Start, TIME
 from ...orbits.segments._point import correct, Plane
 from ._bifurcation import OrbitBifurcation, OrbitHalfBranch
 from ._test_functions import CORNERS
-from ._tracer import alike, midpoint, OrbitPoint, OrbitTracer, spot_of, told_by, turned, Zero
+from ._tracer import alike, midpoint, OrbitPoint, OrbitTracer, spot_of, test_values, turned, Zero
 
 
 BRANCHING = (3e-3, 1e-3, 1e-2, 3e-4, 1e-4, 1e-5)  # lengths of the step by which a branch is entered along its direction
@@ -21,7 +21,7 @@ MOST_LAPS = 8  # in which an autonomous orbit may pass through the same points s
 
 
 @dataclasses.dataclass
-class Half:
+class Departure:
     """A half-branch: the orbit on it next to the point, with its tangent away from it."""
 
     spot: OrbitPoint
@@ -29,7 +29,7 @@ class Half:
     laps: int
     side: int
     cycle: Cycle | None = None
-    partner: "Half | None" = None
+    partner: "Departure | None" = None
 
     @property
     def multipliers(self) -> np.ndarray:
@@ -48,7 +48,7 @@ class Node:
 
     spot: OrbitPoint
     order: int
-    halves: list[Half]
+    halves: list[Departure]
     bifurcation: OrbitBifurcation
 
     def is_at(self, zero: Zero, curve: OrbitCurve) -> bool:
@@ -70,17 +70,17 @@ def tracer_for(tracer: OrbitTracer, curve: OrbitCurve) -> OrbitTracer:
     return dataclasses.replace(tracer, curve=curve)
 
 
-def _kernel(tracer: OrbitTracer, course: Course, u: Any) -> np.ndarray:
-    return np.linalg.svd(np.asarray(linearised(tracer.curve, course, u)))[2][-2:]
+def _kernel(tracer: OrbitTracer, itinerary: OrbitItinerary, u: Any) -> np.ndarray:
+    return np.linalg.svd(np.asarray(linearised(tracer.curve, itinerary, u)))[2][-2:]
 
 
-def set_out(tracer: OrbitTracer, course: Course, u: Any, direction: np.ndarray) -> OrbitPoint | None:
+def set_out(tracer: OrbitTracer, itinerary: OrbitItinerary, u: Any, direction: np.ndarray) -> OrbitPoint | None:
     """An orbit on the branch that leaves `u` in this direction, with its tangent away from it."""
     for step in BRANCHING:
-        look = correct(tracer.curve, course, Plane(u, direction, step))
+        look = correct(tracer.curve, itinerary, Plane(u, direction, step))
         if not bool(look.good):
             continue
-        spot = spot_of(tracer.curve, look, course)
+        spot = spot_of(tracer.curve, look, itinerary)
         if float(np.linalg.norm(spot.look.u - u)) < 5 * step and admissible(tracer.curve, spot):
             return _along(spot, direction)
     return None
@@ -92,38 +92,38 @@ def _along(spot: OrbitPoint, direction: np.ndarray) -> OrbitPoint:
 
 def admissible(curve: OrbitCurve, spot: OrbitPoint) -> bool:
     scale = float(spot.look.branch[1])
-    return all(v > -1e-9 for t, v in told_by(curve, spot, scale).items() if t.kind in CORNERS)
+    return all(v > -1e-9 for t, v in test_values(curve, spot, scale).items() if t.kind in CORNERS)
 
 
-def _repeated(spot: OrbitPoint, times: int, period: float) -> tuple[Course, Start]:
+def _repeated(spot: OrbitPoint, times: int, period: float) -> tuple[OrbitItinerary, Start]:
     """The orbit several times."""
-    n = int(spot.course.num)
+    n = int(spot.itinerary.num)
     rows = list(range(n)) * times
-    course = spot.course.take(rows, capacity_for(len(rows)))
+    itinerary = spot.itinerary.take(rows, capacity_for(len(rows)))
     shift = np.repeat(np.arange(times) * period, n)
     look = spot.look
     first = (np.tile(look.begin[:n], times) + shift, np.tile(look.end[:n], times) + shift)
-    if course.ends[0] == TIME:  # one segment, for as long
-        course = spot.course
-        return course, Start(course, look.begin[:1], look.begin[:1] + times * period, look.x[:1])
-    return course, Start(course, *first, np.tile(look.x[:n], (times, 1)))
+    if itinerary.ends[0] == TIME:  # one segment, for as long
+        itinerary = spot.itinerary
+        return itinerary, Start(itinerary, look.begin[:1], look.begin[:1] + times * period, look.x[:1])
+    return itinerary, Start(itinerary, *first, np.tile(look.x[:n], (times, 1)))
 
 
 def flip_at(tracer: OrbitTracer, name: str, spot: OrbitPoint) -> Node | None:
     """Where a multiplier is -1: the orbit twice is a branch point of orbits of twice the period."""
     curve = tracer.curve
-    course, start = _repeated(spot, 2, float(spot.look.period))
+    itinerary, start = _repeated(spot, 2, float(spot.look.period))
     twice = tracer_for(tracer, with_order(curve, 2 * int(curve.order)))
     u = twice.curve.pack(start, spot.parameter)
-    kernel = _kernel(twice, course, u)
+    kernel = _kernel(twice, itinerary, u)
     # On the orbit twice the parameter moves; on what is born here it does not, to first order.
     direction = np.array([-kernel[1][-1], kernel[0][-1]]) @ kernel
     direction = direction / np.linalg.norm(direction)
-    born = set_out(twice, course, u, direction)
+    born = set_out(twice, itinerary, u, direction)
     halves = []
     if born is not None:
-        halves.append(Half(born, twice.curve, 2, side_of(born, spot, curve)))
-    made = OrbitBifurcation.smooth("flip", name, spot, curve, [told(half) for half in halves])
+        halves.append(Departure(born, twice.curve, 2, side_of(born, spot, curve)))
+    made = OrbitBifurcation.smooth("flip", name, spot, curve, [half_branch_of(half) for half in halves])
     return Node(spot, int(curve.order), halves, made)
 
 
@@ -137,32 +137,32 @@ def _across(kernel: np.ndarray, tangent: np.ndarray) -> np.ndarray:
 def branch_point_at(tracer: OrbitTracer, name: str, spot: OrbitPoint) -> Node | None:
     """Where a multiplier is 1 and another branch crosses."""
     curve = tracer.curve
-    n = int(spot.course.num)
+    n = int(spot.itinerary.num)
     cover = cover_of(spot, curve)
     if cover == 2:  # seen from the branch of twice the period
         rows = list(range(n // 2))
-        course = spot.course.take(rows, capacity_for(len(rows))) if n > 1 else spot.course
+        itinerary = spot.itinerary.take(rows, capacity_for(len(rows))) if n > 1 else spot.itinerary
         once = tracer_for(tracer, with_order(curve, int(curve.order) // 2))
-        start = Start(course, spot.look.begin[: len(rows)], spot.look.end[: len(rows)], spot.look.x[: len(rows)])
-        base = once.corrected(course, once.curve.pack(start, spot.parameter))
+        start = Start(itinerary, spot.look.begin[: len(rows)], spot.look.end[: len(rows)], spot.look.x[: len(rows)])
+        base = once.orbit_near(itinerary, once.curve.pack(start, spot.parameter))
         if base is None:
             return None
         node = flip_at(once, name, base)
         if node is not None:
             for other in (base, turned(base)):
                 side = int(np.sign(other.look.tangent[-1]))
-                node.halves.append(Half(other, once.curve, 1, side))
+                node.halves.append(Departure(other, once.curve, 1, side))
             node.halves[-1].partner, node.halves[-2].partner = node.halves[-2], node.halves[-1]
         return node
-    kernel = _kernel(tracer, spot.course, spot.look.u)
+    kernel = _kernel(tracer, spot.itinerary, spot.look.u)
     tangent = np.asarray(spot.look.tangent)
     halves = []
     for direction in (tangent, _across(kernel, tangent)):
         pair = []
         for sign in (1, -1):
-            born = set_out(tracer, spot.course, spot.look.u, sign * direction)
+            born = set_out(tracer, spot.itinerary, spot.look.u, sign * direction)
             if born is not None:
-                pair.append(Half(born, curve, 1, side_of(born, spot, curve)))
+                pair.append(Departure(born, curve, 1, side_of(born, spot, curve)))
         if len(pair) == 2:
             pair[0].partner, pair[1].partner = pair[1], pair[0]
         halves += pair
@@ -170,20 +170,20 @@ def branch_point_at(tracer: OrbitTracer, name: str, spot: OrbitPoint) -> Node | 
     kind = "symmetry breaking" if sides in ([-1, -1, -1, 1], [-1, 1, 1, 1]) else "transcritical"
     if len(halves) != 4:
         kind = "branch point"
-    made = OrbitBifurcation.smooth(kind, name, spot, curve, [told(half) for half in halves])
+    made = OrbitBifurcation.smooth(kind, name, spot, curve, [half_branch_of(half) for half in halves])
     return Node(spot, int(curve.order), halves, made)
 
 
 def cover_of(spot: OrbitPoint, curve: OrbitCurve, tolerance: float = 1e-4) -> int:
     """How many times the orbit passes through the same points."""
-    look, n, order = spot.look, int(spot.course.num), int(curve.order)
+    look, n, order = spot.look, int(spot.itinerary.num), int(curve.order)
     period = float(look.period)
-    t, x, _ = midpoint(curve, spot, spot.course.rows)
+    t, x, _ = midpoint(curve, spot, spot.itinerary.rows)
 
     def away(times: int) -> float:
         later = float(look.begin[0]) + (t - float(look.begin[0]) + period / times) % period
         i = next((i for i in range(n) if look.begin[i] <= later <= look.end[i]), n - 1)
-        args = (look.parameter, look.begin[i], later, look.x[i], spot.course.mode[i], spot.course.part[i])
+        args = (look.parameter, look.begin[i], later, look.x[i], spot.itinerary.mode[i], spot.itinerary.part[i])
         return float(np.max(np.abs(np.asarray(state_at(curve, *args)) - x) / np.asarray(curve.sizes)))
 
     most = MOST_LAPS if curve.autonomous else order
@@ -195,12 +195,14 @@ def side_of(half: OrbitPoint, at: OrbitPoint, curve: OrbitCurve) -> int:
     return int(np.sign(half.parameter - at.parameter)) or int(np.sign(half.look.tangent[-1]))
 
 
-def told(half: Half) -> OrbitHalfBranch:
+def half_branch_of(half: Departure) -> OrbitHalfBranch:
     spot = half.spot
-    return OrbitHalfBranch(half.side, half.laps, half.multipliers, spot.stable, itinerary(half.curve, spot.course))
+    return OrbitHalfBranch(
+        half.side, half.laps, half.multipliers, spot.stable, itinerary_text(half.curve, spot.itinerary)
+    )
 
 
-def itinerary(curve: OrbitCurve, course: Course) -> str:
+def itinerary_text(curve: OrbitCurve, itinerary: OrbitItinerary) -> str:
     names = [k.name for k in curve.model.switches]
-    rows = [", ".join(f"{n} {int(m):+d}" for n, m in zip(names, course.mode[i])) for i in course.rows]
+    rows = [", ".join(f"{n} {int(m):+d}" for n, m in zip(names, itinerary.mode[i])) for i in itinerary.rows]
     return " -> ".join(rows)

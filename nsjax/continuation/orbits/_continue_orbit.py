@@ -15,7 +15,7 @@ from ...flow._integrator import Integrator
 from ...maps._corner_normal_form import Cycle
 from ...orbits._orbit import Orbit
 from ...orbits.segments._equations import OrbitCurve
-from ...orbits.segments._itinerary import Course
+from ...orbits.segments._itinerary import OrbitItinerary
 from ...orbits.segments._point import PointData
 from ...system._model import SwitchedSystem
 from ...system._parameter import get_parameter, parameter_path
@@ -23,13 +23,13 @@ from ...system._system import System
 from .._archive import Archive, plain, save, table
 from .._progress import ProgressLine
 from ._bifurcation import Origin
-from ._branch import orbit_branch, OrbitBranch, OrbitStrand, Point
-from ._branch_switching import Half, itinerary, Node
+from ._branch import orbit_branch, OrbitBranch, OrbitBranchSegment, Point
+from ._branch_switching import Departure, itinerary_text, Node
 from ._explorer import Exit, Frontier, OrbitExplorer, OrbitTree
 from ._record import Measures, Recorder
 from ._start import curve_and_start
 from ._test_functions import Test
-from ._tracer import Arc, OrbitPoint, OrbitTracer, Zero
+from ._tracer import OrbitPoint, OrbitTracer, Trace, Zero
 
 
 GIVEN = ("model", "path", "like", "integrator")  # what of a curve follows from the model, and is not saved
@@ -40,16 +40,16 @@ TYPES = {
         Frontier,
         Origin,
         Exit,
-        Arc,
+        Trace,
         Zero,
         Test,
         OrbitPoint,
         PointData,
-        Course,
+        OrbitItinerary,
         Node,
-        Half,
+        Departure,
         Cycle,
-        OrbitStrand,
+        OrbitBranchSegment,
         Point,
     ),
 }
@@ -98,7 +98,7 @@ def continue_orbit(
     - `scale`: the typical size of each component of the state, like the state; by default what it has along the orbit
         (1 where that is less than 1e-9, as along x = 0).
     - `max_step`: the longest step, in units of `scale`, of the orbit's period, and of the interval.
-    - `max_points`: of each arc between two special points.
+    - `max_points`: of each trace between two special points.
     - `max_branches`: so many at most; if there are more a warning says so.
     - `max_laps`: the longest period that is followed, over that of `orbit`.
     - `virtual`: whether to follow the segments of the orbits at each corner beyond it too, though the system has no
@@ -182,13 +182,13 @@ class OrbitContinuation(Generic[StateT]):
         curve, start = curve_and_start(system, orbit, parameter, interval, scale, integrator)
         start, value = start.filled(), get_parameter(curve.model.system, curve.path)
         tracer = OrbitTracer(curve, max_step, max_points)
-        spot = tracer.corrected(start.course, curve.pack(start, value))
+        spot = tracer.orbit_near(start.itinerary, curve.pack(start, value))
         if spot is None:
             raise ValueError("Argument `orbit` must be an orbit of `system`, but none was found next to it.")
         self._explorer = OrbitExplorer(
             tracer, parameter, max_branches, max_laps * int(curve.order), Recorder(record or {}), virtual
         )
-        self._tree = self._explorer.planted(spot)
+        self._tree = self._explorer.first_tree(spot)
 
     def __iter__(self) -> "OrbitContinuation[StateT]":
         return self
@@ -208,15 +208,15 @@ class OrbitContinuation(Generic[StateT]):
     def branch(self) -> OrbitBranch[StateT]:
         """What was found so far."""
         curve, name = self._explorer.tracer.curve, self._explorer.name
-        found = [orbit_branch(curve, curve.model.system, name, *pair, itinerary) for pair in self._tree.branches]
+        found = [orbit_branch(curve, curve.model.system, name, *pair, itinerary_text) for pair in self._tree.branches]
         return dataclasses.replace(found[0], others=tuple(found[1:]))
 
     def __str__(self) -> str:
-        strands = [strand for pair in self._tree.branches for strand in pair]
-        special = {id(found) for strand in strands for _, found in strand.special}
-        value = next(strand.points[-1].spot.parameter for strand in self._tree.branches[-1] if strand.points)
+        pieces = [piece for pair in self._tree.branches for piece in pair]
+        special = {id(found) for piece in pieces for _, found in piece.special}
+        value = next(piece.points[-1].spot.parameter for piece in self._tree.branches[-1] if piece.points)
         return (
-            f"branch {len(self._tree.branches)}, {sum(len(strand.points) for strand in strands)} points, "
+            f"branch {len(self._tree.branches)}, {sum(len(piece.points) for piece in pieces)} points, "
             f"{self._explorer.name} = {value:.6g}, {len(special)} special points"
         )
 

@@ -37,7 +37,7 @@ class Recorder:
     def __call__(self, curve: OrbitCurve, spot: OrbitPoint) -> dict[str, np.ndarray]:
         if not self.measures:
             return {}
-        n, look = int(spot.course.num), spot.look
+        n, look = int(spot.itinerary.num), spot.look
         # The largest and the least components are not left to the samples.
         ts = np.concatenate([look.ts[:n], look.turns_t[:n]], axis=1)
         xs = np.concatenate([look.xs[:n], look.turns_x[:n]], axis=1)

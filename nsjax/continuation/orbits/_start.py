@@ -1,4 +1,4 @@
-"""Where the continuation of an orbit sets out: the curve of its orbits over a parameter, and its course on it."""
+"""Where the continuation of an orbit sets out: the curve of its orbits over a parameter, and its itinerary on it."""
 
 import dataclasses
 
@@ -35,7 +35,7 @@ def check_precision(orbit: Orbit) -> None:
 def curve_and_start(
     system: System, orbit: Orbit, parameter: str, interval: tuple[float, float], scale: Y | None, integrator: Integrator
 ) -> tuple[OrbitCurve, Start]:
-    """The curve, in units of the orbit, and the orbit with its course."""
+    """The curve, in units of the orbit, and the orbit with its itinerary."""
     path = parameter_path(system, parameter)
     low, high = (float(x) for x in interval)
     check_precision(orbit)
@@ -82,8 +82,8 @@ def _exact(curve: OrbitCurve, start: Start, value: float) -> int:
     """Which flows are known by their exponentials, given the forcing along the orbit."""
     if curve.exact == NEVER:
         return NEVER
-    flow, course = curve.on(start.course).flow, start.course
-    states = [curve.state(jnp.asarray(course.mode[i]), jnp.asarray(course.part[i])) for i in course.rows]
+    flow, itinerary = curve.on(start.itinerary).flow, start.itinerary
+    states = [curve.state(jnp.asarray(itinerary.mode[i]), jnp.asarray(itinerary.part[i])) for i in itinerary.rows]
     rows = zip(start.begin, start.end, start.x, states)
     known = all(bool(fits(flow, a, b, x, jnp.asarray(value), state)) for a, b, x, state in rows)
     return curve.exact if known else NEVER
@@ -113,6 +113,6 @@ def phase_of(curve: OrbitCurve, start: Start) -> tuple[np.ndarray, np.ndarray]:
     x = np.asarray(start.x[0])
     if not curve.autonomous:
         return np.zeros_like(x), x
-    state = curve.state(jnp.asarray(start.course.mode[0]), jnp.asarray(start.course.part[0]))
+    state = curve.state(jnp.asarray(start.itinerary.mode[0]), jnp.asarray(start.itinerary.part[0]))
     f = np.asarray(jfu.ravel_pytree(curve.model.flow(jnp.asarray(start.begin[0]), curve.unravel(x), state))[0])
     return f / np.maximum(f @ f, 1e-300), x

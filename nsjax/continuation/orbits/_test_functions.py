@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from ...derivatives._floquet import trivial
 from ...orbits.segments._equations import OrbitCurve
-from ...orbits.segments._itinerary import Course, EVENT, GRAZING, REPELLING_EXIT
+from ...orbits.segments._itinerary import EVENT, GRAZING, OrbitItinerary, REPELLING_EXIT
 from ...orbits.segments._point import PointData
 
 
@@ -33,18 +33,18 @@ def corner_tests(rows: int, slots: int) -> list[Test]:
     return of_segments + [Test("guard", i, j) for i in range(rows) for j in range(slots)]
 
 
-def corner_values(curve: OrbitCurve, look: PointData, course: Course) -> tuple[Any, Any]:
+def corner_values(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary) -> tuple[Any, Any]:
     """Positive as long as the orbit is one; and which of these there are."""
     xp = look.begin.__array_namespace__()
-    index = xp.arange(len(look.begin), dtype=course.num.dtype)
-    last, ends = course.num - 1, xp.asarray(course.ends)
+    index = xp.arange(len(look.begin), dtype=itinerary.num.dtype)
+    last, ends = itinerary.num - 1, xp.asarray(itinerary.ends)
     real, event = index <= last, ends == EVENT
     ends_before, ends_after = ends[xp.where(index == 0, last, index - 1)], ends[xp.where(index >= last, 0, index + 1)]
     values = [-look.rates, look.margins, (look.end - look.begin) / curve.time, look.least.ravel()]
     there = [
         real & event & (ends_after != REPELLING_EXIT),
         real & event & xp.isfinite(look.margins),
-        real & (course.num > 1) & (ends != GRAZING) & (ends_before != GRAZING),
+        real & (itinerary.num > 1) & (ends != GRAZING) & (ends_before != GRAZING),
         (real[:, None] & xp.isfinite(look.least)).ravel(),
     ]
     return xp.concatenate(values), xp.concatenate(there)

@@ -1,4 +1,4 @@
-"""Along a branch of periodic orbits in one course, to the next point at which others may meet it."""
+"""Along a branch of periodic orbits in one itinerary, to the next point at which others may meet it."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ import numpy as np
 
 from ..._numerics._bracket import bracketed
 from ...orbits.segments._equations import OrbitCurve, state_at
-from ...orbits.segments._itinerary import Course
+from ...orbits.segments._itinerary import OrbitItinerary
 from ...orbits.segments._point import correct, Plane, PointData
 from ._test_functions import (
     BRANCH,
@@ -37,10 +37,10 @@ ASIDE = 1e-2  # from a branch point, in steps: a fold that is nearer is the bran
 
 @dataclasses.dataclass
 class OrbitPoint:
-    """A point of a branch: what is seen there, its course, and its multipliers."""
+    """A point of a branch: what is seen there, its itinerary, and its multipliers."""
 
     look: PointData
-    course: Course
+    itinerary: OrbitItinerary
     multipliers: np.ndarray
     stable: bool
     monodromy: np.ndarray
@@ -50,27 +50,27 @@ class OrbitPoint:
         return float(self.look.parameter)
 
 
-def spot_of(curve: OrbitCurve, look: PointData, course: Course) -> OrbitPoint:
+def spot_of(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary) -> OrbitPoint:
     look = jax.device_get(look)
-    return OrbitPoint(look, course, look.multipliers, bool(look.stable), look.monodromy)
+    return OrbitPoint(look, itinerary, look.multipliers, bool(look.stable), look.monodromy)
 
 
 def midpoint(curve: OrbitCurve, spot: OrbitPoint, rows: Iterable[int]) -> tuple[float, np.ndarray, np.ndarray]:
     """Time, state and mode in the middle of the longest of some segments, if possible one that no surface holds: beside
     it orbits are near each other, as they need not be beside an event or where static friction holds."""
-    look, course = spot.look, spot.course
+    look, itinerary = spot.look, spot.itinerary
     length = {}
     for i in rows:
-        length[i] = (look.end[i] - look.begin[i]) * (1e-6 if curve.model.holds(course.mode[i]) else 1.0)
+        length[i] = (look.end[i] - look.begin[i]) * (1e-6 if curve.model.holds(itinerary.mode[i]) else 1.0)
     longest = max(length.values())
     best = next(i for i in length if length[i] >= longest - 1e-6 * abs(longest))
     t = np.asarray((look.begin[best] + look.end[best]) / 2)
-    mode = np.asarray(course.mode[best])
-    x = state_at(curve, look.parameter, look.begin[best], t, look.x[best], mode, course.part[best])
+    mode = np.asarray(itinerary.mode[best])
+    x = state_at(curve, look.parameter, look.begin[best], t, look.x[best], mode, itinerary.part[best])
     return float(t), np.asarray(x), mode
 
 
-def told_by(curve: OrbitCurve, spot: OrbitPoint, log: float) -> dict[Test, float]:
+def test_values(curve: OrbitCurve, spot: OrbitPoint, log: float) -> dict[Test, float]:
     """All test functions of a point; the determinant is divided by exp(log)."""
     share = float(spot.look.u[-1])
     ends = {Test("low"): share, Test("high"): 1 - share}
@@ -79,7 +79,7 @@ def told_by(curve: OrbitCurve, spot: OrbitPoint, log: float) -> dict[Test, float
 
 
 def of_corners(curve: OrbitCurve, spot: OrbitPoint) -> dict[Test, float]:
-    values, there = corner_values(curve, spot.look, spot.course)
+    values, there = corner_values(curve, spot.look, spot.itinerary)
     names = corner_tests(*spot.look.least.shape)
     return {names[i]: float(values[i]) for i in np.flatnonzero(there)}
 
@@ -100,9 +100,9 @@ class Zero(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Arc:
-    """Points one after the other, up to one at which the course ends. It is a value, from which `OrbitTracer.further`
-    makes the next.
+class Trace:
+    """Points one after the other, up to one at which their itinerary ends. It is a value: `OrbitTracer.further` makes
+    the next from it.
 
     - `spots`: the points.
     - `begin`: a point at which it has been all round.
@@ -123,7 +123,7 @@ class Arc:
 
     @property
     def end(self) -> Zero | None:
-        """That with which the course ends."""
+        """That with which the itinerary ends."""
         return None if self.at is None or self.at.test.kind in PASSED else self.at
 
     @property
@@ -133,7 +133,7 @@ class Arc:
 
 @dataclasses.dataclass
 class OrbitTracer:
-    """Traces arcs; virtual ones heed nothing but the ends of the interval."""
+    """Traces traces; virtual ones heed nothing but the ends of the interval."""
 
     curve: OrbitCurve
     max_step: float
@@ -142,8 +142,8 @@ class OrbitTracer:
 
     def at(self, spot: OrbitPoint, s: float, guess: Any = None) -> OrbitPoint | None:
         """The point at the distance `s` along the tangent of another."""
-        found = correct(self.curve, spot.course, Plane(spot.look.u, spot.look.tangent, s), guess)
-        return spot_of(self.curve, found, spot.course) if bool(found.good) else None
+        found = correct(self.curve, spot.itinerary, Plane(spot.look.u, spot.look.tangent, s), guess)
+        return spot_of(self.curve, found, spot.itinerary) if bool(found.good) else None
 
     def between(self, a: OrbitPoint, b: OrbitPoint, value: float) -> OrbitPoint | None:
         """The point between two others at which the parameter has this value."""
@@ -158,28 +158,28 @@ class OrbitTracer:
         except (ArithmeticError, ValueError):
             return None
 
-    def corrected(self, course: Course, guess: Any, border: Any = None) -> OrbitPoint | None:
-        """The orbit in a course next to a guess, at the same parameter (or on another plane)."""
+    def orbit_near(self, itinerary: OrbitItinerary, guess: Any, border: Any = None) -> OrbitPoint | None:
+        """The orbit of an itinerary next to a guess, at the same parameter (or on another plane)."""
         border = np.eye(len(guess))[-1] if border is None else border
-        found = correct(self.curve, course, Plane(guess, border))
-        return spot_of(self.curve, found, course) if bool(found.good) else None
+        found = correct(self.curve, itinerary, Plane(guess, border))
+        return spot_of(self.curve, found, itinerary) if bool(found.good) else None
 
-    def further(self, arc: Arc) -> Arc:
-        """The arc with one point more, or with the reason why there is none."""
-        if not arc.ahead:
-            arc = self.stepped(arc)
-        if not arc.ahead:
-            return arc
-        here, *ahead = arc.ahead
+    def further(self, trace: Trace) -> Trace:
+        """The trace with one point more, or with the reason why there is none."""
+        if not trace.ahead:
+            trace = self.next_step(trace)
+        if not trace.ahead:
+            return trace
+        here, *ahead = trace.ahead
         zero = here if isinstance(here, Zero) else None
         spot = here.spot if isinstance(here, Zero) else here
-        return dataclasses.replace(arc, spots=(*arc.spots, spot), ahead=tuple(ahead), at=zero)
+        return dataclasses.replace(trace, spots=(*trace.spots, spot), ahead=tuple(ahead), at=zero)
 
-    def stepped(self, arc: Arc) -> Arc:
+    def next_step(self, trace: Trace) -> Trace:
         """The next step along the tangent at the last point, as long as it can be."""
-        spot, length = arc.spots[-1], arc.length
-        if len(arc.spots) >= self.max_points:
-            return dataclasses.replace(arc, why=f"max_points = {self.max_points}, at {spot.parameter:.10g}")
+        spot, length = trace.spots[-1], trace.length
+        if len(trace.spots) >= self.max_points:
+            return dataclasses.replace(trace, why=f"max_points = {self.max_points}, at {spot.parameter:.10g}")
         while True:
             step = self.at(spot, length)
             turn = np.inf
@@ -190,36 +190,36 @@ class OrbitTracer:
                 break
             length /= 2
             if length < SHORTEST:
-                return dataclasses.replace(arc, why=f"the last orbit that could be found, at {spot.parameter:.10g}")
+                return dataclasses.replace(trace, why=f"the last orbit that could be found, at {spot.parameter:.10g}")
         zeros = tuple(z for z in zeros if z.test.kind != "Neimark-Sacker" or _complex_pair(z.spot))
         if zeros and zeros[-1].test.kind not in PASSED:
-            return dataclasses.replace(arc, ahead=zeros)
-        steps = arc.steps + 1
-        if arc.begin is not None and steps > 3 and self.passes(arc.begin, spot, step):
-            return dataclasses.replace(arc, ahead=(*zeros, arc.begin), closed=True)
+            return dataclasses.replace(trace, ahead=zeros)
+        steps = trace.steps + 1
+        if trace.begin is not None and steps > 3 and self.passes(trace.begin, spot, step):
+            return dataclasses.replace(trace, ahead=(*zeros, trace.begin), closed=True)
         speed = float(np.max(np.abs(step.look.tangent) / np.maximum(1, np.abs(step.look.u))))
         length = min(self.max_step / speed, length * float(np.clip(TURN / max(turn, 1e-9), 0.5, 2)))
-        return dataclasses.replace(arc, ahead=(*zeros, step), length=length, steps=steps)
+        return dataclasses.replace(trace, ahead=(*zeros, step), length=length, steps=steps)
 
     def passes(self, begin: OrbitPoint, spot: OrbitPoint, step: OrbitPoint) -> bool:
         """Whether another orbit lies on the curve between two points."""
         value, upwards = begin.parameter, step.parameter > spot.parameter
         if not min(spot.parameter, step.parameter) <= value < max(spot.parameter, step.parameter):
             return False
-        if begin.course.key() != spot.course.key() or (begin.look.tangent[-1] > 0) != upwards:
+        if begin.itinerary.key() != spot.itinerary.key() or (begin.look.tangent[-1] > 0) != upwards:
             return False
         here = self.between(spot, step, value)
         return here is not None and alike(here, begin, self.curve, SAME)
 
     def zeros(self, spot: OrbitPoint, step: OrbitPoint, length: float) -> list[Zero] | None:
-        """The zeros of test functions between two points, in their order, up to the first at which the course ends;
+        """The zeros of test functions between two points, in their order, up to the first at which the itinerary ends;
         None if the step must be shorter for them to be told."""
         scale = float(spot.look.branch[1])
-        found, lost = self.changed(spot, step, length, scale)
+        found, lost = self.sign_changes(spot, step, length, scale)
         for test in lost:
             # Beside a singular point, which another test function may know.
             small = SINGULAR if test == BRANCH else VANISHES
-            at = next((z for z in found if abs(told_by(self.curve, z.spot, scale).get(test, np.inf)) < small), None)
+            at = next((z for z in found if abs(test_values(self.curve, z.spot, scale).get(test, np.inf)) < small), None)
             if at is None and (test != BRANCH or length > UNSEEN):
                 return None
             found += [] if at is None else [at._replace(test=test)]
@@ -231,12 +231,14 @@ class OrbitTracer:
         final = next((z for z in found if z.test.kind not in PASSED), None)
         if final is None:
             return found
-        return self.ended(spot, self.with_those_before(spot, final, found, near, scale), near)
+        return self.up_to_end(spot, self.with_those_before(spot, final, found, near, scale), near)
 
-    def changed(self, spot: OrbitPoint, step: OrbitPoint, length: float, scale: float) -> tuple[list[Zero], list[Test]]:
+    def sign_changes(
+        self, spot: OrbitPoint, step: OrbitPoint, length: float, scale: float
+    ) -> tuple[list[Zero], list[Test]]:
         """The zeros of the test functions that change their sign between two points, and those whose zero is not to be
         found."""
-        before, after = (told_by(self.curve, p, scale) for p in (spot, step))
+        before, after = (test_values(self.curve, p, scale) for p in (spot, step))
         found, lost = [], []
         for test, value in before.items():
             if test not in after or after[test] == 0:
@@ -248,7 +250,7 @@ class OrbitTracer:
                 continue
             if test.kind in (*CORNERS, "low", "high") and after[test] > 0:
                 continue  # it comes from where it could not be: a start on the point itself
-            zero = self.located(spot, step, length, test, scale)
+            zero = self.locate(spot, step, length, test, scale)
             found += [] if zero is None else [zero]
             lost += [test] if zero is None else []
         return found, lost
@@ -256,23 +258,25 @@ class OrbitTracer:
     def with_those_before(
         self, spot: OrbitPoint, final: Zero, found: list[Zero], near: float, scale: float
     ) -> list[Zero]:
-        """What lies before the end of the course may have changed back beyond it, or at the end itself: it is looked at
-        a little before that. (At a branch point it may turn.)"""
+        """What lies before the end of the itinerary may have changed back beyond it, or at the end itself: a place a
+        little before that tells. (At a branch point it may turn.)"""
         s, last = self.short_of(spot, final, 2 * near)
-        before, there = (told_by(self.curve, p, scale) for p in (spot, last))
+        before, there = (test_values(self.curve, p, scale) for p in (spot, last))
         for test in (t for t in before if t.kind in PASSED and before[t] * there[t] < 0):
             if test.kind == "fold" and final.test == BRANCH:
                 continue
             if any(z.test == test and z.s <= final.s for z in found):
                 continue
-            zero = self.located(spot, last, s, test, scale)
+            zero = self.locate(spot, last, s, test, scale)
             found = found if zero is None else [*found, zero]
         return sorted(found, key=lambda zero: zero.s)
 
-    def ended(self, spot: OrbitPoint, found: list[Zero], near: float) -> list[Zero]:
-        """The zeros up to the first at which the course ends, with all that vanishes there."""
+    def up_to_end(self, spot: OrbitPoint, found: list[Zero], near: float) -> list[Zero]:
+        """The zeros up to the first at which the itinerary ends, with all that vanishes there."""
         end = next(i for i, zero in enumerate(found) if zero.test.kind not in PASSED)
-        last = self.told(spot, found[end], [z for z in found if abs(z.s - found[end].s) < near and z is not found[end]])
+        last = self.with_others(
+            spot, found[end], [z for z in found if abs(z.s - found[end].s) < near and z is not found[end]]
+        )
         out = found[:end]
         if last.test.kind in (*CORNERS, "branch"):
             # A test function may pass its zero together with the corner's; it is the corner's then.
@@ -285,7 +289,7 @@ class OrbitTracer:
         here = None if s <= 0 else self.at(spot, s, spot.look.u + s / zero.s * (zero.spot.look.u - spot.look.u))
         return (zero.s, zero.spot) if here is None else (s, here)
 
-    def told(self, before: OrbitPoint, zero: Zero, together: list[Zero]) -> Zero:
+    def with_others(self, before: OrbitPoint, zero: Zero, together: list[Zero]) -> Zero:
         """What vanishes at one point, by the first of `CORNERS`."""
         rank = {kind: i for i, kind in enumerate((*CORNERS, "branch", "low", "high"))}
         several = sorted([zero, *together], key=lambda z: rank.get(z.test.kind, 99))
@@ -296,12 +300,12 @@ class OrbitTracer:
         return first._replace(others=others, side=side)
 
     def value(self, spot: OrbitPoint, test: Test, scale: float) -> float:
-        found = told_by(self.curve, spot, scale).get(test)
+        found = test_values(self.curve, spot, scale).get(test)
         if found is None:
             raise ArithmeticError(f"{test} is not a number")
         return found
 
-    def located(self, spot: OrbitPoint, step: OrbitPoint, length: float, test: Test, scale: float) -> Zero | None:
+    def locate(self, spot: OrbitPoint, step: OrbitPoint, length: float, test: Test, scale: float) -> Zero | None:
         """By bracketing: the curve is smooth there, and so is the test function but for the least value of a guard."""
         seen: dict[float, OrbitPoint] = {0.0: spot, length: step}
         chord = step.look.u - spot.look.u
@@ -318,13 +322,13 @@ class OrbitTracer:
         if s is None or test == BRANCH:
             # Beside its zero the equations are singular: the last that could be solved tells about where.
             s = min(
-                (s for s in seen if s > 0), key=lambda s: abs(told_by(self.curve, seen[s], scale).get(test, np.inf))
+                (s for s in seen if s > 0), key=lambda s: abs(test_values(self.curve, seen[s], scale).get(test, np.inf))
             )
-            found = self.interpolated(spot, s, length, chord, scale, test)
+            found = self.interpolate(spot, s, length, chord, scale, test)
             return None if found is None else Zero(found[0], test, found[1])
         return Zero(s, test, seen[s])
 
-    def interpolated(
+    def interpolate(
         self, spot: OrbitPoint, s: float, length: float, chord: Any, scale: float, test: Test
     ) -> tuple[float, OrbitPoint] | None:
         """A point at which the equations are singular, by polynomials through points beside it."""
@@ -332,7 +336,7 @@ class OrbitTracer:
         for share in (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0):
             node = s + 0.5 * length * share
             here = self.at(spot, node, spot.look.u + node / length * chord)
-            if here is not None and test in told_by(self.curve, here, scale):
+            if here is not None and test in test_values(self.curve, here, scale):
                 nodes.append(share)
                 spots.append(here)
         if len(nodes) < 4:
@@ -346,8 +350,8 @@ class OrbitTracer:
         root = min(real, key=abs)
         weights = np.linalg.solve(powers.T, root ** np.arange(len(nodes)))
         u = weights @ np.stack([here.look.u for here in spots])
-        found = correct(self.curve, spot.course, Plane(u, spot.look.tangent), newton=False)
-        return s + 0.5 * length * root, spot_of(self.curve, found, spot.course)
+        found = correct(self.curve, spot.itinerary, Plane(u, spot.look.tangent), newton=False)
+        return s + 0.5 * length * root, spot_of(self.curve, found, spot.itinerary)
 
 
 def alike(a: OrbitPoint, b: OrbitPoint, curve: OrbitCurve, tolerance: float) -> bool:

@@ -1,4 +1,4 @@
-"""The curve on which the periodic orbits of one course lie when a parameter varies.
+"""The curve on which the periodic orbits of one itinerary lie when a parameter varies.
 
 The states and times of all events are unknown. So the curve is smooth where the return map is not: at grazing, where a
 segment has no length, and on surfaces that repel.
@@ -22,7 +22,7 @@ from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ...system._parameter import Path
 from ._guess import landing
-from ._itinerary import Course, EVENT, GRAZING, REPELLING_EXIT, Start, TIME
+from ._itinerary import EVENT, GRAZING, OrbitItinerary, REPELLING_EXIT, Start, TIME
 from ._segment_flow import ALWAYS, FREE_MODES, SegmentFlow
 
 
@@ -49,11 +49,11 @@ class OrbitCurve(eqx.Module):
     reference: Float[Array, " n"]
     integrator: Integrator = eqx.field(static=True)
     exact: int = eqx.field(static=True)  # which flows are known by their exponentials
-    slides: bool = eqx.field(static=True, default=True)  # whether surfaces hold segments of the course
+    slides: bool = eqx.field(static=True, default=True)  # whether surfaces hold segments of the itinerary
 
-    def on(self, course: Course) -> "OrbitCurve":
-        """With flows as the modes of a course allow."""
-        return dataclasses.replace(self, slides=any(self.model.holds(course.mode[i]) for i in course.rows))
+    def on(self, itinerary: OrbitItinerary) -> "OrbitCurve":
+        """With flows as the modes of an itinerary allow."""
+        return dataclasses.replace(self, slides=any(self.model.holds(itinerary.mode[i]) for i in itinerary.rows))
 
     @property
     def flow(self) -> SegmentFlow:
@@ -80,7 +80,7 @@ class OrbitCurve(eqx.Module):
         return z[:, 0] * self.time, z[:, 1] * self.time, z[:, 2:] * self.sizes, value
 
     def pack(self, start: Start, value: Any) -> np.ndarray:
-        capacity, n = len(start.course.slot), len(self.sizes)
+        capacity, n = len(start.itinerary.slot), len(self.sizes)
         z = np.zeros((capacity, n + 2))
         for i in range(capacity):
             j = min(i, len(start.begin) - 1)
@@ -112,15 +112,15 @@ class OrbitCurve(eqx.Module):
         along = jax.jvp(lambda t, x: self.guard(model, t, x, state, slot, entry), (t, x), (jnp.ones_like(t), f))
         return along[1]
 
-    def residual(self, u: Array, course: Course, origin: Array) -> tuple[Array, Scalar, Array]:
+    def residual(self, u: Array, itinerary: OrbitItinerary, origin: Array) -> tuple[Array, Scalar, Array]:
         """What vanishes: for each segment its beginning in time and state, and what ends it. Also the time at which the
         last segment ends, and the states at the ends."""
         begin, end, x, value = self.parts(u)
         rows = len(begin)
         model = self.model.with_parameter(self.path, value)
-        index = jnp.arange(rows, dtype=course.num.dtype)
-        happened, final = index < course.num, index == course.num - 1
-        mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
+        index = jnp.arange(rows, dtype=itinerary.num.dtype)
+        happened, final = index < itinerary.num, index == itinerary.num - 1
+        mode, part = jnp.asarray(itinerary.mode), jnp.asarray(itinerary.part)
         following = jnp.where(final[:, None], mode[:1], jnp.roll(mode, -1, axis=0))
 
         def row(a: Scalar, b: Scalar, x: Array, mode: Array, part: Array) -> Array:
@@ -136,13 +136,13 @@ class OrbitCurve(eqx.Module):
                 out = landing(model, k, t, self.unravel(x), self.state(mode, part), tuple(after))
             return jfu.ravel_pytree(out[0])[0], out[1]
 
-        after, rest = jax.vmap(jump)(end, last, mode, part, following, course.slot, course.ends)
-        before = jnp.where(index == 0, course.num - 1, index - 1)
+        after, rest = jax.vmap(jump)(end, last, mode, part, following, itinerary.slot, itinerary.ends)
+        before = jnp.where(index == 0, itinerary.num - 1, index - 1)
         forced = None if self.autonomous else jnp.asarray(model.system.period, end.dtype) * self.order.astype(end.dtype)
         arrival = (end + rest)[before]
         anchor = jnp.zeros_like(end[0]) if forced is None else arrival[0] - forced
         if not self.autonomous:
-            anchor = jnp.where(course.ends[0] == TIME, lax.stop_gradient(origin[0] * self.time), anchor)
+            anchor = jnp.where(itinerary.ends[0] == TIME, lax.stop_gradient(origin[0] * self.time), anchor)
         started = begin - jnp.where(index == 0, anchor, arrival)
 
         def ended(a: Scalar, b: Scalar, x: Array, last: Array, mode: Array, part: Array, *what: Array) -> Scalar:
@@ -161,7 +161,7 @@ class OrbitCurve(eqx.Module):
             closing = self.normal @ (x - self.reference) if forced is None else b - a - forced
             return jnp.where(ends == TIME, closing, out)
 
-        finish = jax.vmap(ended)(begin, end, x, last, mode, part, course.slot, course.entry, course.ends)
+        finish = jax.vmap(ended)(begin, end, x, last, mode, part, itinerary.slot, itinerary.entry, itinerary.ends)
         # In the units of the unknowns.
         whole = jnp.concatenate([started[:, None] / self.time, finish[:, None], (x - after[before]) / self.sizes], 1)
         fill = (u - lax.stop_gradient(origin))[: -self.dimension].reshape(rows, -1)
@@ -180,11 +180,11 @@ def guard_sizes(curve: OrbitCurve, start: Start) -> np.ndarray:
 
     if not curve.model.slots:
         return np.zeros(0)
-    rows = start.course.rows
-    seen = [sizes(start.begin[i], start.x[i], start.course.mode[i], start.course.part[i]) for i in rows]
+    rows = start.itinerary.rows
+    seen = [sizes(start.begin[i], start.x[i], start.itinerary.mode[i], start.itinerary.part[i]) for i in rows]
     # Those of a switch that is held are seen in that mode alone.
     every = np.stack([np.ones(len(curve.model.switches), np.int32) * m for m in (-1, 0, 1)])
-    seen += [sizes(start.begin[0], start.x[0], mode, start.course.part[0]) for mode in every]
+    seen += [sizes(start.begin[0], start.x[0], mode, start.itinerary.part[0]) for mode in every]
     found = np.max(np.abs(np.asarray(seen)), axis=0)
     return np.where(np.isfinite(found) & (found > 0), found, 1.0)
 
@@ -202,12 +202,12 @@ def state_at(curve: OrbitCurve, value: Array, a: Scalar, t: Scalar, x: Array, mo
     return curve.flow.arrive(a, t, x, value, curve.state(mode, part))
 
 
-def linearised(curve: OrbitCurve, course: Course, u: Array) -> Array:
+def linearised(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> Array:
     """The derivatives of the equations, row by row of size one."""
-    return _linearised(curve.on(course), course, u)
+    return _linearised(curve.on(itinerary), itinerary, u)
 
 
 @eqx.filter_jit
-def _linearised(curve: OrbitCurve, course: Course, u: Array) -> Array:
-    df = jax.jacfwd(lambda v: curve.residual(v, course, u)[0])(u)
+def _linearised(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> Array:
+    df = jax.jacfwd(lambda v: curve.residual(v, itinerary, u)[0])(u)
     return df / row_sizes(df)[:, None]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Scalar, Y
-from ...derivatives._saltation import landed
+from ...derivatives._saltation import after_event
 from ...derivatives._variational import arcs
 from ...flow._integrator import Integrator
 from ...flow._mode_flow import ModeFlow
@@ -173,6 +173,6 @@ def landing(model: SwitchedSystem, k: Array, t: Scalar, y: Y, ending: ModeState,
     """The state after the event of switch k (-1: none), and the time up to the state of rest."""
     out = (y, jnp.zeros_like(t))
     for i in range(len(model.switches)):
-        hit = landed(model, i, t, y, ending, after)
+        hit = after_event(model, i, t, y, ending, after)
         out = jax.tree.map(lambda a, b, now=k == i: jnp.where(now, a, b), hit, out)
     return out

@@ -25,10 +25,10 @@ from .._orbit import Orbit
 EVENT, TIME, GRAZING, REPELLING_EXIT = range(4)
 
 
-class Course(NamedTuple):
+class OrbitItinerary(NamedTuple):
     """The segments of an orbit in the order of time, cyclic: each begins where the one before it ends.
 
-    Rows beyond the last are there to fill up, so that orbits with different courses are one program's.
+    Rows beyond the last are there to fill up, so that orbits with different itineraries are one program's.
     """
 
     mode: Int[np.ndarray, "rows switches"]
@@ -43,36 +43,38 @@ class Course(NamedTuple):
         return range(int(self.num))
 
     def key(self) -> tuple:
-        """The same for equal courses, whatever segment is their first."""
+        """The same for equal itineraries, whatever segment is their first."""
         n = int(self.num)
         columns = zip(*(np.asarray(column)[:n].tolist() for column in self[:5]))
         rows = [tuple(map(str, row)) for row in columns]
         return min(tuple(rows[i:] + rows[:i]) for i in range(n))
 
-    def take(self, rows: list[int], capacity: int) -> "Course":
+    def take(self, rows: list[int], capacity: int) -> "OrbitItinerary":
         """These rows (which may occur several times), filled up."""
         index = np.array(rows + [rows[-1]] * (capacity - len(rows)))
         mode, part, ends, slot, entry = (np.asarray(column)[index] for column in self[:5])
-        return Course(mode, part, ends, slot, entry, np.asarray(len(rows), np.int32))
+        return OrbitItinerary(mode, part, ends, slot, entry, np.asarray(len(rows), np.int32))
 
 
-def same_course(a: Course, b: Course) -> bool:
+def same_itinerary(a: OrbitItinerary, b: OrbitItinerary) -> bool:
     """Whether they are equal row by row."""
     n = int(a.num)
     return n == int(b.num) and all(np.array_equal(x[:n], y[:n]) for x, y in zip(a[:5], b[:5]))
 
 
 class Start(NamedTuple):
-    """An orbit with the course that it takes: times and states at the beginnings and ends of its segments."""
+    """An orbit with the itinerary that it takes: times and states at the beginnings and ends of its segments."""
 
-    course: Course
+    itinerary: OrbitItinerary
     begin: np.ndarray
     end: np.ndarray
     x: np.ndarray
 
     def filled(self) -> "Start":
         """With as many rows as programs are compiled for."""
-        return self._replace(course=self.course.take(list(self.course.rows), capacity_for(int(self.course.num))))
+        return self._replace(
+            itinerary=self.itinerary.take(list(self.itinerary.rows), capacity_for(int(self.itinerary.num)))
+        )
 
 
 def capacity_for(segments: int) -> int:
@@ -139,7 +141,7 @@ def _looked_at(model: SwitchedSystem, like: Y, systems: System, diaries: EventRe
 
 
 def starts_of(model: SwitchedSystem, orbits: list[Orbit]) -> list[Start]:
-    """The courses of orbits of one model that differ in its parameters, from their events."""
+    """The itineraries of orbits of one model that differ in its parameters, from their events."""
     diaries = [EventRecord.of(orbit.events) for orbit in orbits]
     systems = [arrays_of(orbit.system, jnp.float64) for orbit in orbits]
     at = [(float(orbit.t0), float(orbit.period), np.asarray(orbit.mode, np.int32)) for orbit in orbits]
@@ -171,8 +173,8 @@ def starts_from(
 
 def _uneventful(t0: float, period: float, mode: np.ndarray, x0: np.ndarray) -> Start:
     none, one = np.zeros((1, len(mode)), np.int32), np.zeros(1, np.int32)
-    course = Course(mode[None], none, one + TIME, one, one, np.asarray(1, np.int32))
-    return Start(course, np.array([t0]), np.array([t0 + period]), x0[None])
+    itinerary = OrbitItinerary(mode[None], none, one + TIME, one, one, np.asarray(1, np.int32))
+    return Start(itinerary, np.array([t0]), np.array([t0 + period]), x0[None])
 
 
 def _start(model: SwitchedSystem, diary: EventRecord, seen: tuple, period: float) -> Start:
@@ -184,7 +186,7 @@ def _start(model: SwitchedSystem, diary: EventRecord, seen: tuple, period: float
         k = int(diary.switch[i])
         guards.append(event_slot(model, k, diary.modes[0][i, k], int(parts_before[i, k]), float(multipliers[i])))
     slot, entry = np.array(guards, np.int32).T
-    course = Course(
+    itinerary = OrbitItinerary(
         diary.modes[1].astype(np.int32),
         parts_after[:n].astype(np.int32),
         np.full(n, EVENT, np.int32),
@@ -192,4 +194,4 @@ def _start(model: SwitchedSystem, diary: EventRecord, seen: tuple, period: float
         entry,
         np.asarray(n, np.int32),
     )
-    return Start(course, diary.t, np.append(diary.t[1:], diary.t[0] + period), diary.states[1])
+    return Start(itinerary, diary.t, np.append(diary.t[1:], diary.t[0] + period), diary.states[1])

@@ -15,7 +15,7 @@ from ..._types import Scalar
 from ...derivatives._floquet import floquet, structural_zeros
 from ...system._model import SwitchedSystem
 from ._equations import OrbitCurve, row_sizes
-from ._itinerary import Course, EVENT, REPELLING_EXIT, TIME
+from ._itinerary import EVENT, OrbitItinerary, REPELLING_EXIT, TIME
 
 
 TOLERANCE = 1e-12  # of Newton's method, in units of the unknowns
@@ -88,41 +88,50 @@ class Plane(NamedTuple):
         return self._replace(distance=np.broadcast_to(np.asarray(self.distance, float), shape))
 
 
-def correct(curve: OrbitCurve, course: Course, plane: Plane, guess: Any = None, newton: bool = True) -> PointData:
+def correct(
+    curve: OrbitCurve, itinerary: OrbitItinerary, plane: Plane, guess: Any = None, newton: bool = True
+) -> PointData:
     """The corrector: the point of the curve on a plane, by Newton's method from a `guess` (by
     default straight ahead), and all that is seen of it; or, without `newton`, of the guess itself."""
     plane = plane.filled()
     guess = plane.origin + np.dot(plane.distance, plane.normal) if guess is None else guess
-    return _correct(curve.on(course), course, plane, guess, np.asarray(newton))
+    return _correct(curve.on(itinerary), itinerary, plane, guess, np.asarray(newton))
 
 
 @eqx.filter_jit
-def _correct(curve: OrbitCurve, course: Course, plane: Plane, guess: Array, newton: Array) -> PointData:
-    return corrected(curve, course, plane, guess, newton)
+def _correct(curve: OrbitCurve, itinerary: OrbitItinerary, plane: Plane, guess: Array, newton: Array) -> PointData:
+    return corrected(curve, itinerary, plane, guess, newton)
 
 
 def corrected(
-    curve: OrbitCurve, course: Course, plane: Plane, guess: Array, newton: Array | bool = True, turns: bool = True
+    curve: OrbitCurve,
+    itinerary: OrbitItinerary,
+    plane: Plane,
+    guess: Array,
+    newton: Array | bool = True,
+    turns: bool = True,
 ) -> PointData:
     """`correct`, within a program; without `turns` the largest and least states are those at the nodes."""
     origin, border, distance = plane
 
     def residual(u: Array, _: Any) -> Array:
-        off = jnp.append(curve.residual(u, course, origin)[0], border @ (u - origin) - distance)
+        off = jnp.append(curve.residual(u, itinerary, origin)[0], border @ (u - origin) - distance)
         return jnp.where(newton, off, u - guess)
 
     u, good = find_root(residual, guess, None, Newton(TOLERANCE, 10))
-    return look_at(curve, course, u, good, plane, turns)
+    return look_at(curve, itinerary, u, good, plane, turns)
 
 
-def look_at(curve: OrbitCurve, course: Course, u: Array, good: Bool[Array, ""], plane: Plane, turns: bool) -> PointData:
+def look_at(
+    curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, good: Bool[Array, ""], plane: Plane, turns: bool
+) -> PointData:
     origin, border, _ = plane
     begin, end, x, value = curve.parts(u)
     n, rows, m = len(curve.sizes), len(begin), curve.dimension
     model = curve.model.with_parameter(curve.path, value)
 
     def equations(u: Array) -> tuple[tuple[Array, Scalar], tuple[Array, Array]]:
-        f, arrival, last = curve.residual(u, course, origin)
+        f, arrival, last = curve.residual(u, itinerary, origin)
         return (f, arrival), (f, last)
 
     (df, closing), (f, last) = jax.jacfwd(equations, has_aux=True)(u)
@@ -136,27 +145,27 @@ def look_at(curve: OrbitCurve, course: Course, u: Array, good: Bool[Array, ""], 
     branch = jnp.stack(jnp.linalg.slogdet(jnp.concatenate([df, along])))
     tangent = along.reshape(jnp.shape(border))
 
-    factors = _factors(curve, course, u, df, closing)
-    index = jnp.arange(rows, dtype=course.num.dtype)
-    mode = jnp.asarray(course.mode)
-    zeros = structural_zeros(model.system, jnp.where((index < course.num)[:, None], mode, mode[:1]))
+    factors = _factors(curve, itinerary, u, df, closing)
+    index = jnp.arange(rows, dtype=itinerary.num.dtype)
+    mode = jnp.asarray(itinerary.mode)
+    zeros = structural_zeros(model.system, jnp.where((index < itinerary.num)[:, None], mode, mode[:1]))
     found = floquet(factors, zeros, curve.autonomous)
-    free = jnp.any((course.ends == REPELLING_EXIT) & (index < course.num))
+    free = jnp.any((itinerary.ends == REPELLING_EXIT) & (index < itinerary.num))
     either = zip(_infinitely_unstable(n, curve.autonomous), found)
     monodromy, multipliers, stable = (jnp.where(free, x, y) for x, y in either)
 
     # Along the way.
-    inside = (index < course.num)[:, None]
-    along = _along(curve, course, u, turns)
+    inside = (index < itinerary.num)[:, None]
+    along = _along(curve, itinerary, u, turns)
     least = along.least[:, 2 * n :]
     low, high = jnp.min(jnp.where(inside, along.least[:, : 2 * n], jnp.inf), axis=0).reshape(2, n)
     length = jnp.sum(jnp.where(inside[:, 0], end - begin, 0))
     mean, square = jnp.sum(jnp.where(inside[..., None], along.sums, 0), axis=0) / length
-    period = end[course.num - 1] - begin[0]
+    period = end[itinerary.num - 1] - begin[0]
     if not curve.autonomous:
         period = jnp.asarray(model.system.period, u.dtype) * curve.order.astype(u.dtype)
     turns_t = begin[:, None] + (end - begin)[:, None] * along.share[:, : 2 * n]
-    rates, values, margins = _at_ends(curve, model, end, last, course)
+    rates, values, margins = _at_ends(curve, model, end, last, itinerary)
     # Beside a branch point rounding moves the root by more than Newton's method is to find it to.
     wrong = jnp.max(jnp.abs(f))
     good = (good | (wrong < TOLERANCE)) & jnp.all(jnp.isfinite(tangent))
@@ -169,16 +178,16 @@ def look_at(curve: OrbitCurve, course: Course, u: Array, good: Bool[Array, ""], 
     )  # fmt: skip
 
 
-def _factors(curve: OrbitCurve, course: Course, u: Array, df: Array, closing: Array) -> Array:
+def _factors(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, df: Array, closing: Array) -> Array:
     """The derivatives from the beginning of each segment to that of the next, at the same time: the blocks of `df`, the
     Jacobian of the equations, from which the moved times are eliminated. `closing`: the derivative of the time at which
     the last segment ends."""
     begin, _, x, value = curve.parts(u)
     n, rows, m = len(curve.sizes), len(begin), curve.dimension
     model = curve.model.with_parameter(curve.path, value)
-    index = jnp.arange(rows, dtype=course.num.dtype)
-    after = jnp.where(index >= course.num - 1, 0, index + 1)
-    mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
+    index = jnp.arange(rows, dtype=itinerary.num.dtype)
+    after = jnp.where(index >= itinerary.num - 1, 0, index + 1)
+    mode, part = jnp.asarray(itinerary.mode), jnp.asarray(itinerary.part)
     field = (
         jax.vmap(lambda t, x, m, p: jfu.ravel_pytree(model.flow(t, curve.unravel(x), curve.state(m, p)))[0])(
             begin, x, mode, part
@@ -190,10 +199,10 @@ def _factors(curve: OrbitCurve, course: Course, u: Array, df: Array, closing: Ar
     own, on = blocks[index, :, index], blocks[after, :, index]
     # The next segment of the last one begins where it ends; of a single one it is the same.
     itself = jnp.zeros(n + 2, u.dtype).at[2:].set(1)
-    on = jnp.where(course.num == 1, on - jnp.diag(itself), on)
-    final = (index == course.num - 1)[:, None]
+    on = jnp.where(itinerary.num == 1, on - jnp.diag(itself), on)
+    final = (index == itinerary.num - 1)[:, None]
     on = on.at[:, 0].set(jnp.where(final, -closing[:-m].reshape(rows, n + 2), on[:, 0]))
-    on = jnp.where((course.ends == TIME)[:, None, None], on.at[:, 0].set(0), on)
+    on = jnp.where((itinerary.ends == TIME)[:, None, None], on.at[:, 0].set(0), on)
 
     def factor(own: Array, on: Array, ends: Array, last_field: Array) -> Array:
         # Unknown of a segment: begin, end, x. Its equations: started, finished, continued.
@@ -204,9 +213,9 @@ def _factors(curve: OrbitCurve, course: Course, u: Array, df: Array, closing: Ar
         plain = -(on[2:, 2:] + jnp.outer(on[2:, 1], move))
         return plain - jnp.outer(last_field, shift)
 
-    factors = jax.vmap(factor)(own, on, course.ends, field[after])
+    factors = jax.vmap(factor)(own, on, itinerary.ends, field[after])
     factors = factors * curve.sizes[:, None] / curve.sizes[None, :]
-    return jnp.where((index < course.num)[:, None, None], factors, jnp.eye(n, dtype=u.dtype))
+    return jnp.where((index < itinerary.num)[:, None, None], factors, jnp.eye(n, dtype=u.dtype))
 
 
 def _infinitely_unstable(n: int, autonomous: bool) -> tuple[Array, Array, Array]:
@@ -216,32 +225,32 @@ def _infinitely_unstable(n: int, autonomous: bool) -> tuple[Array, Array, Array]
 
 
 @eqx.filter_jit
-def extremes(curve: OrbitCurve, course: Course, u: Array) -> tuple[Array, Array]:
+def extremes(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> tuple[Array, Array]:
     """The least and the largest value of each component of the state along an orbit."""
-    found = _along(curve, course, u, turns=True, guards=False).least
-    inside = jnp.arange(len(found), dtype=course.num.dtype) < course.num
+    found = _along(curve, itinerary, u, turns=True, guards=False).least
+    inside = jnp.arange(len(found), dtype=itinerary.num.dtype) < itinerary.num
     low, high = jnp.min(jnp.where(inside[:, None], found, jnp.inf), axis=0).reshape(2, -1)
     return low, -high
 
 
-def _along(curve: OrbitCurve, course: Course, u: Array, turns: bool, guards: bool = True) -> Minima:
+def _along(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, turns: bool, guards: bool = True) -> Minima:
     """Of every segment the least values of the state's components, of their negatives (with `turns` between nodes too),
     and of the guards, these divided by the zeros that they must have at the ends."""
     begin, end, x, value = curve.parts(u)
     rows, slots = len(begin), len(curve.model.slots) * guards
     orders = jnp.zeros((rows, 2, 0), x.dtype)
     if slots:
-        zeros = jnp.asarray(zeros_at_begin(curve, course), x.dtype)  # rows, slots
-        here = jnp.arange(slots, dtype=course.slot.dtype) == course.slot[:, None]
-        index = jnp.arange(rows, dtype=course.num.dtype)
-        after = jnp.where(index >= course.num - 1, 0, index + 1)
+        zeros = jnp.asarray(zeros_at_begin(curve, itinerary), x.dtype)  # rows, slots
+        here = jnp.arange(slots, dtype=itinerary.slot.dtype) == itinerary.slot[:, None]
+        index = jnp.arange(rows, dtype=itinerary.num.dtype)
+        after = jnp.where(index >= itinerary.num - 1, 0, index + 1)
         # On what is left freely it comes tangentially.
-        order = jnp.where(course.ends[after] == REPELLING_EXIT, 2, 1)[:, None]
-        last = jnp.where((course.ends == EVENT)[:, None] & here, order, 0)
+        order = jnp.where(itinerary.ends[after] == REPELLING_EXIT, 2, 1)[:, None]
+        last = jnp.where((itinerary.ends == EVENT)[:, None] & here, order, 0)
         orders = jnp.stack([zeros, last.astype(x.dtype)], axis=1)
     plain = jnp.zeros((rows, 2, 2 * len(curve.sizes)), x.dtype)
     orders = jnp.concatenate([plain, orders], axis=2)
-    segments = begin, end, x, jnp.asarray(course.mode), jnp.asarray(course.part)
+    segments = begin, end, x, jnp.asarray(itinerary.mode), jnp.asarray(itinerary.part)
     return jax.vmap(lambda segment, orders: along_segment(curve, value, segment, orders, turns))(segments, orders)
 
 
@@ -275,16 +284,16 @@ def along_segment(curve: OrbitCurve, value: Array, segment: tuple, orders: Array
     return in_order(minima(sample, functions, x, orders[:, places], below), places)
 
 
-def zeros_at_begin(curve: OrbitCurve, course: Course) -> Array:
+def zeros_at_begin(curve: OrbitCurve, itinerary: OrbitItinerary) -> Array:
     """How many zeros each guard has at the beginning of each segment: that of the surface just left."""
     model = curve.model
-    index = jnp.arange(len(course.slot), dtype=course.num.dtype)
-    before = jnp.where(index == 0, course.num - 1, index - 1)
-    slot, ends, mode_before = course.slot[before], course.ends[before], jnp.asarray(course.mode)[before]
-    mode = jnp.asarray(course.mode)
+    index = jnp.arange(len(itinerary.slot), dtype=itinerary.num.dtype)
+    before = jnp.where(index == 0, itinerary.num - 1, index - 1)
+    slot, ends, mode_before = itinerary.slot[before], itinerary.ends[before], jnp.asarray(itinerary.mode)[before]
+    mode = jnp.asarray(itinerary.mode)
     columns = []
     switch = jnp.asarray([s.switch for s in model.slots], jnp.int32)[slot]
-    entry = course.entry[before]
+    entry = itinerary.entry[before]
     part = jnp.asarray([s.part for s in model.slots], jnp.int32)[slot]
     component = jnp.where(entry > 0, entry, jnp.where(part >= 0, part, 0))
     for s in model.slots:
@@ -309,13 +318,13 @@ def zeros_at_begin(curve: OrbitCurve, course: Course) -> Array:
 
 
 def _at_ends(
-    curve: OrbitCurve, model: SwitchedSystem, end: Array, last: Array, course: Course
+    curve: OrbitCurve, model: SwitchedSystem, end: Array, last: Array, itinerary: OrbitItinerary
 ) -> tuple[Array, Array, Array]:
     """Rate and value of the guard that ends each segment, and |λ| - b where it crosses what could hold it."""
     if not model.slots:
         return -jnp.ones_like(end), jnp.zeros_like(end), jnp.ones_like(end)
-    mode, part = jnp.asarray(course.mode), jnp.asarray(course.part)
-    final = jnp.arange(len(end), dtype=course.num.dtype) == course.num - 1
+    mode, part = jnp.asarray(itinerary.mode), jnp.asarray(itinerary.part)
+    final = jnp.arange(len(end), dtype=itinerary.num.dtype) == itinerary.num - 1
     following = jnp.where(final[:, None], mode[:1], jnp.roll(mode, -1, axis=0))
 
     def row(t: Scalar, x: Array, m: Array, p: Array, after: Array, slot: Array, entry: Array) -> tuple:
@@ -334,4 +343,4 @@ def _at_ends(
         rate = curve.rate(model, t, x, state, slot, entry)
         return rate, curve.guard(model, t, x, state, slot, entry), margin
 
-    return jax.vmap(row)(end, last, mode, part, following, course.slot, course.entry)
+    return jax.vmap(row)(end, last, mode, part, following, itinerary.slot, itinerary.entry)

@@ -15,7 +15,7 @@ from ..._numerics._autodiff import frozen
 from ..._numerics._root import find_root, Newton
 from ..._types import Scalar, Y
 from ...derivatives._floquet import floquet, forwards, structural_zeros
-from ...derivatives._saltation import fired, saltation_matrices
+from ...derivatives._saltation import event_function, saltation_matrices
 from ...flow._integrator import Integrator
 from ...flow._results import is_okay, RESULTS
 from ...flow._solution import Events
@@ -31,7 +31,7 @@ from ._guess import landing, SegmentGuess, where
 def _guard(model: SwitchedSystem, k: Array, t: Scalar, y: Y, state: ModeState) -> Scalar:
     out = jnp.zeros_like(t)
     for i in range(len(model.switches)):
-        out = jnp.where(k == i, fired(model, i, t, y, state), out)
+        out = jnp.where(k == i, event_function(model, i, t, y, state), out)
     return out
 
 

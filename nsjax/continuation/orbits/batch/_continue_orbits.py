@@ -19,7 +19,7 @@ from ....flow._results import is_okay
 from ....orbits._find_orbit import find_orbit
 from ....orbits._orbit import Orbit
 from ....orbits.segments._equations import OrbitCurve
-from ....orbits.segments._itinerary import capacity_for, Course, Start, starts_of
+from ....orbits.segments._itinerary import capacity_for, OrbitItinerary, Start, starts_of
 from ....orbits.segments._point import extremes
 from ....sweeps._sweep import sweep
 from ....system._parameter import get_parameter, parameter_path, put_parameter
@@ -151,8 +151,8 @@ def continue_orbits(
     own = [i for i, one in enumerate(good) if one]
     starts = dict(zip(own, starts_of(curve.model, [each[i] for i in own])))
     # One program for all: with the flows of modes that surfaces hold, if there are any.
-    curve = dataclasses.replace(curve, slides=any(curve.on(start.course).slides for start in starts.values()))
-    capacity = capacity_for(max(int(start.course.num) for start in starts.values()))
+    curve = dataclasses.replace(curve, slides=any(curve.on(start.itinerary).slides for start in starts.values()))
+    capacity = capacity_for(max(int(start.itinerary.num) for start in starts.values()))
     rows = [_lane_of(curve, each[i], starts[i], capacity) for i in (j if good[j] else first for j in range(len(each)))]
     lanes = jax.tree.map(lambda *xs: np.stack(xs), *rows)
     twice = jax.tree.map(lambda x: np.concatenate([x, x]), (lanes, np.array(good)))
@@ -174,7 +174,7 @@ class _Lane(NamedTuple):
     order: Int[np.ndarray, ""]
     normal: Float[np.ndarray, " n"]
     reference: Float[np.ndarray, " n"]
-    course: Course
+    itinerary: OrbitItinerary
     u: Float[np.ndarray, " unknowns"]
 
 
@@ -182,10 +182,10 @@ def _lane_of(curve: OrbitCurve, orbit: Orbit, start: Start, capacity: int) -> _L
     system = arrays_of(orbit.system, jnp.float64)
     own = dataclasses.replace(curve, model=curve.model.with_system(system))
     normal, reference = phase_of(own, start)
-    start = start._replace(course=start.course.take(list(start.course.rows), capacity))
+    start = start._replace(itinerary=start.itinerary.take(list(start.itinerary.rows), capacity))
     u = curve.pack(start, get_parameter(system, curve.path))
     order, system = order_of(system, orbit), jax.tree.map(np.asarray, system)
-    return _Lane(system, order, normal, reference, start.course, u)
+    return _Lane(system, order, normal, reference, start.itinerary, u)
 
 
 class _Follow(eqx.Module):
@@ -197,7 +197,7 @@ class _Follow(eqx.Module):
 
     def __call__(self, lane: _Lane, good: Any, upwards: Any) -> Lane:
         curve = _curve_of(self.curve, lane)
-        return follow_lane(curve, lane.course, lane.u, good, upwards, self.max_step, self.points)
+        return follow_lane(curve, lane.itinerary, lane.u, good, upwards, self.max_step, self.points)
 
 
 class _Extremes(eqx.Module):
@@ -206,7 +206,7 @@ class _Extremes(eqx.Module):
     curve: OrbitCurve
 
     def __call__(self, lane: _Lane, u: Any) -> tuple[Array, Array]:
-        return extremes(_curve_of(self.curve, lane), lane.course, u)
+        return extremes(_curve_of(self.curve, lane), lane.itinerary, u)
 
 
 def _curve_of(curve: OrbitCurve, lane: _Lane) -> OrbitCurve:
@@ -217,7 +217,7 @@ def _curve_of(curve: OrbitCurve, lane: _Lane) -> OrbitCurve:
 def _gathered(curve: OrbitCurve, parameter: str, lanes: _Lane, found: Lane) -> OrbitBranches:
     """Both ways of each lane as one branch."""
     number = len(found.count) // 2
-    ways = [_way(curve, lanes.course, found, i) for i in range(2 * number)]
+    ways = [_way(curve, lanes.itinerary, found, i) for i in range(2 * number)]
     places, kinds, ends, starts = [], [], [], []
     for i in range(number):
         (up, above, top), (down, below, bottom) = ways[i], ways[i + number]
@@ -267,7 +267,7 @@ def _gathered(curve: OrbitCurve, parameter: str, lanes: _Lane, found: Lane) -> O
     )
 
 
-def _way(curve: OrbitCurve, courses: Course, found: Lane, i: int) -> tuple[list[int], list[str], str]:
+def _way(curve: OrbitCurve, itineraries: OrbitItinerary, found: Lane, i: int) -> tuple[list[int], list[str], str]:
     """One way of a lane: its rows in their order, what each of them is, and why it ends."""
     doing = int(found.doing[i])
     if doing == NO_ORBIT:
@@ -276,9 +276,9 @@ def _way(curve: OrbitCurve, courses: Course, found: Lane, i: int) -> tuple[list[
     order = [int(j) for j in np.argsort(arcs, kind="stable")]
     if doing == ENDED:
         order = [j for j in order if arcs[j] <= found.arc[i] + found.end[i]]
-    course = jax.tree.map(lambda x: x[i % len(courses.num)], courses)
-    tests = lane_tests(len(course.slot), len(curve.model.slots))
-    words = [_word(curve, course, tests[k]) if k >= 0 else "" for k in kinds[order]]
+    itinerary = jax.tree.map(lambda x: x[i % len(itineraries.num)], itineraries)
+    tests = lane_tests(len(itinerary.slot), len(curve.model.slots))
+    words = [_word(curve, itinerary, tests[k]) if k >= 0 else "" for k in kinds[order]]
     for j, word in enumerate(words):
         rho = found.rows.multipliers[i, order[j]]
         # A product of multipliers is 1, as at a Neimark-Sacker point, but they are real.
@@ -287,19 +287,19 @@ def _way(curve: OrbitCurve, courses: Course, found: Lane, i: int) -> tuple[list[
         if word == "fold" and "branch point" in words[max(0, j - 1) : j + 2]:
             words[j] = ""
     if doing == ENDED:
-        return order, words, _word(curve, course, tests[found.last[i]])
+        return order, words, _word(curve, itinerary, tests[found.last[i]])
     points = len(found.arcs[i])
     enough = f"more than {points} points" if len(arcs) == points else f"more than {EACH * points} orbits computed"
     return order, words, "lost" if doing == LOST else enough
 
 
-def _word(curve: OrbitCurve, course: Course, test: Test) -> str:
+def _word(curve: OrbitCurve, itinerary: OrbitItinerary, test: Test) -> str:
     if test.kind in ("low", "high"):
         return "end of the interval"
     if test == BRANCH:
         return "branch point"
     if test.kind in PASSED:
         return test.kind
-    slot = test.slot if test.kind == "guard" else int(course.slot[test.row])
+    slot = test.slot if test.kind == "guard" else int(itinerary.slot[test.row])
     kind = {"rate": "tangency", "guard": "grazing"}.get(test.kind, test.kind)
     return f"{kind} of {curve.model.switches[curve.model.slots[slot].switch].name}"

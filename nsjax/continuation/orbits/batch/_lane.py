@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...._types import Scalar
 from ....orbits.segments._equations import OrbitCurve
-from ....orbits.segments._itinerary import Course
+from ....orbits.segments._itinerary import OrbitItinerary
 from ....orbits.segments._point import corrected, Plane, PointData
 from .._test_functions import BRANCH, branch_value, CIRCLE, circle_values, corner_tests, corner_values, PASSED, Test
 from .._tracer import FIRST, SHORTEST, TURN, TURNED
@@ -68,42 +68,50 @@ def lane_tests(rows: int, slots: int) -> list[Test]:
     return [Test("low"), Test("high"), *corner_tests(rows, slots), Test("fold"), BRANCH, *CIRCLE]
 
 
-def values_of(curve: OrbitCurve, look: PointData, course: Course, log: Scalar) -> Array:
+def values_of(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary, log: Scalar) -> Array:
     share = look.u[-1]
-    corners, there = corner_values(curve, look, course)
+    corners, there = corner_values(curve, look, itinerary)
     smooth = jnp.stack([look.tangent[-1], branch_value(look, log)])
     circle = circle_values(look.multipliers, curve.autonomous)
     ends = jnp.stack([share, 1 - share])
     return jnp.concatenate([ends, jnp.where(there, corners, 1), smooth, circle])
 
 
-def place_of(curve: OrbitCurve, look: PointData, course: Course, log: Scalar) -> Place:
+def place_of(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary, log: Scalar) -> Place:
     # In the middle of the longest segment, if possible of one that no surface holds.
-    mode, held = jnp.asarray(course.mode), jnp.zeros(len(look.begin), bool)
+    mode, held = jnp.asarray(itinerary.mode), jnp.zeros(len(look.begin), bool)
     for k in curve.model.holdable:
         held |= curve.model.held(k, mode[:, k])
-    length = jnp.where(jnp.arange(len(held), dtype=course.num.dtype) < course.num, look.end - look.begin, -jnp.inf)
+    length = jnp.where(
+        jnp.arange(len(held), dtype=itinerary.num.dtype) < itinerary.num, look.end - look.begin, -jnp.inf
+    )
     i = jnp.argmax(length * jnp.where(held, 1e-6, 1.0))
     middle = look.ts.shape[1] // 2
     row = Row(
         look.parameter, look.period, look.ts[i, middle], look.xs[i, middle], look.u, look.multipliers,
         look.stable,
     )  # fmt: skip
-    return Place(look.u, look.tangent, look.branch[1], values_of(curve, look, course, log), row)
+    return Place(look.u, look.tangent, look.branch[1], values_of(curve, look, itinerary, log), row)
 
 
 def follow_lane(
-    curve: OrbitCurve, course: Course, u: Array, found: Bool[Array, ""], upwards: Array, max_step: Array, points: int
+    curve: OrbitCurve,
+    itinerary: OrbitItinerary,
+    u: Array,
+    found: Bool[Array, ""],
+    upwards: Array,
+    max_step: Array,
+    points: int,
 ) -> Lane:
     """The branch from `u` on, to its end, to the first corner, or to so many points."""
     zero, none = jnp.zeros_like(u[0]), jnp.zeros((), jnp.int32)
     border = jnp.zeros_like(u).at[-1].set(1)
     blank = jax.eval_shape(
-        lambda: place_of(curve, corrected(curve, course, Plane(u, border, zero), u, turns=False), course, zero)
+        lambda: place_of(curve, corrected(curve, itinerary, Plane(u, border, zero), u, turns=False), itinerary, zero)
     )
     at = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)._replace(u=u, tangent=border)
     rows = jax.tree.map(lambda x: jnp.zeros((points, *x.shape), x.dtype), blank.row)
-    tests = lane_tests(len(course.slot), len(curve.model.slots))
+    tests = lane_tests(len(itinerary.slot), len(curve.model.slots))
     ends = jnp.asarray([test != BRANCH and test.kind not in PASSED for test in tests])
     lane = Lane(
         at=at, far=at, length=zero, doing=jnp.where(found, STARTING, NO_ORBIT).astype(jnp.int32),
@@ -116,7 +124,7 @@ def follow_lane(
         return (lane.doing <= LOCATING) & (lane.count < points) & (lane.work < EACH * points)
 
     def step(lane: Lane) -> Lane:
-        moved = _moved(curve, course, lane, ends, upwards, max_step)
+        moved = _moved(curve, itinerary, lane, ends, upwards, max_step)
         return jax.tree.map(lambda new, old: jnp.where(going(lane), new, old), moved, lane)
 
     return lax.while_loop(going, step, lane)
@@ -136,17 +144,19 @@ def _written(lane: Lane, row: Row, arc: Scalar, kind: Any, when: Bool[Array, ""]
     )
 
 
-def _moved(curve: OrbitCurve, course: Course, lane: Lane, ends: Array, upwards: Array, max_step: Array) -> Lane:
+def _moved(
+    curve: OrbitCurve, itinerary: OrbitItinerary, lane: Lane, ends: Array, upwards: Array, max_step: Array
+) -> Lane:
     """One more orbit: the next point, or one nearer to a zero."""
     at, locating, starting = lane.at, lane.doing == LOCATING, lane.doing == STARTING
     chord = (lane.far.u - at.u) / jnp.where(locating, lane.length, 1)
     s = jnp.where(locating, _between(lane), lane.length)
     guess = at.u + s * jnp.where(locating, chord, at.tangent)
-    look = corrected(curve, course, Plane(at.u, at.tangent, s), guess, turns=False)
+    look = corrected(curve, itinerary, Plane(at.u, at.tangent, s), guess, turns=False)
     turn = jnp.where(starting & (look.tangent[-1] * upwards < 0), -1, 1).astype(s.dtype)
     # The sign of a determinant of which the tangent is a row.
     look = look._replace(tangent=turn * look.tangent, branch=look.branch * jnp.stack([turn, jnp.ones_like(turn)]))
-    here = place_of(curve, look, course, jnp.where(starting, look.branch[1], at.log))
+    here = place_of(curve, look, itinerary, jnp.where(starting, look.branch[1], at.log))
     lane = lane._replace(work=lane.work + 1)
     first = lane._replace(
         at=here,

@@ -1,5 +1,7 @@
 """Corners of branches of periodic orbits: the orbit touches the tip of a surface, grazes one, or a segment vanishes."""
 
+import dataclasses
+
 import numpy as np
 
 from ....maps._corner_normal_form import corner_kind, CornerMap, Cycle, Cycles, find_cycles
@@ -11,13 +13,13 @@ from .._bifurcation import OrbitBifurcation, Origin
 from .._branch_switching import (
     branch_point_at,
     cover_of,
+    Departure,
     flip_at,
-    Half,
+    half_branch_of,
     Node,
     set_out,
     side_of,
     together,
-    told,
     tracer_for,
     with_order,
 )
@@ -81,8 +83,8 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
 
 def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple[OrbitTracer, Zero] | None:
     """The corner of an orbit that is seen several times, seen once: the lap that ends with the first of the places."""
-    curve, look, course = tracer.curve, zero.spot.look, zero.spot.course
-    n, whole, last = int(course.num), float(look.period), zero.test.row
+    curve, look, itinerary = tracer.curve, zero.spot.look, zero.spot.itinerary
+    n, whole, last = int(itinerary.num), float(look.period), zero.test.row
     lap, slack = whole / times, KNOWN * whole
     t = look.end[last] - lap
     lap_rows, begins, ends = [], [], []
@@ -97,7 +99,7 @@ def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple
     begins[0] = t
     x = look.x[lap_rows].copy()
     x[0] = look.x[(last + 1) % n]  # what ends here begins anew
-    short = course.take(lap_rows, capacity_for(len(lap_rows)))
+    short = itinerary.take(lap_rows, capacity_for(len(lap_rows)))
     once = tracer_for(tracer, with_order(curve, int(curve.order) // times))
     u = once.curve.pack(Start(short, np.array(begins), np.array(ends), x), zero.spot.parameter)
     border = np.zeros_like(u)
@@ -107,7 +109,7 @@ def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple
     ):  # it stays zero: the parameter may be least there
         at = (len(lap_rows) - 1) * (len(curve.sizes) + 2)
         border[[-1, at, at + 1]] = 0.0, -1.0, 1.0
-    spot = once.corrected(short, u, border)
+    spot = once.orbit_near(short, u, border)
     if spot is None or not together(spot, zero.spot, curve, NEIGHBOUR):
         return None
     tests = [t._replace(row=lap_rows.index(t.row)) for t in (zero.test, *zero.others) if t.row in lap_rows]
@@ -116,7 +118,7 @@ def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple
 
 def is_impact(curve: OrbitCurve, spot: OrbitPoint, row: int) -> bool:
     """Whether a segment ends with an impact: one that becomes a grazing does nothing any more."""
-    slot = curve.model.slots[int(spot.course.slot[row])]
+    slot = curve.model.slots[int(spot.itinerary.slot[row])]
     return isinstance(curve.model.switches[slot.switch], impact) and not slot.holding
 
 
@@ -148,7 +150,7 @@ def _through(corner: CornerMap, side: int, arrived: tuple[int, ...]) -> Cycles:
     return Cycles(found, (), (), 1, 2)
 
 
-def _pair(halves: list[Half]) -> None:
+def _pair(halves: list[Departure]) -> None:
     """The branch itself goes on: of the orbits of one lap the two, or those that are symmetric."""
     single = [h for h in halves if h.laps == 1]
     if len(single) != 2:
@@ -178,7 +180,7 @@ def described(
     spot: OrbitPoint,
     mapped: ReturnMap,
     cycles: Cycles,
-    halves: list[Half],
+    halves: list[Departure],
     *,
     touches: list[Touch],
     arrived: tuple[int, ...],
@@ -198,7 +200,7 @@ def described(
         crossings = eigenvalue_crossings(*sides, multipliers=True) if len(sides[0]) else []
     surfaces = tuple(
         dict.fromkeys(
-            curve.model.switches[curve.model.slots[int(spot.course.slot[t.row])].switch].name for t in touches
+            curve.model.switches[curve.model.slots[int(spot.itinerary.slot[t.row])].switch].name for t in touches
         )
     )
     square = np.resize(mapped.corner.square, len(arrived))
@@ -211,7 +213,7 @@ def described(
         name,
         spot,
         curve,
-        [told(h) for h in halves],
+        [half_branch_of(h) for h in halves],
         by_count,
         crossings if finite else None,
         surfaces=surfaces,
@@ -223,7 +225,7 @@ def described(
 
 def _held(curve: OrbitCurve, spot: OrbitPoint) -> int:
     """How many segments a surface holds."""
-    return sum(curve.model.holds(spot.course.mode[i]) for i in spot.course.rows)
+    return sum(curve.model.holds(spot.itinerary.mode[i]) for i in spot.itinerary.rows)
 
 
 def _multipliers(monodromy: np.ndarray) -> np.ndarray:
@@ -246,35 +248,35 @@ def _reduced(curve: OrbitCurve, monodromy: np.ndarray) -> np.ndarray:
 def repelled_at(tracer: OrbitTracer, name: str, spot: OrbitPoint, rows: list[int]) -> Node | None:
     """Where the orbit comes tangentially onto a surface that static friction holds: beyond, orbits slide on it where it
     repels, and may leave it at any point (section 6.7)."""
-    curve, n = tracer.curve, int(spot.course.num)
+    curve, n = tracer.curve, int(spot.itinerary.num)
     (row,) = rows[:1]
     after = (row + 1) % n
-    slot = curve.model.slots[int(spot.course.slot[after])]
-    if not (slot.holding and curve.model.static(slot.switch)) or spot.course.ends[after] != EVENT:
+    slot = curve.model.slots[int(spot.itinerary.slot[after])]
+    if not (slot.holding and curve.model.static(slot.switch)) or spot.itinerary.ends[after] != EVENT:
         return None
-    ends = np.array(spot.course.ends)
+    ends = np.array(spot.itinerary.ends)
     ends[after] = REPELLING_EXIT
     halves = []
-    for course in (spot.course, spot.course._replace(ends=ends)):
-        kernel = np.linalg.svd(np.asarray(linearised(curve, course, spot.look.u)))[2][-1]
+    for itinerary in (spot.itinerary, spot.itinerary._replace(ends=ends)):
+        kernel = np.linalg.svd(np.asarray(linearised(curve, itinerary, spot.look.u)))[2][-1]
         for sign in (1, -1):
-            born = set_out(tracer, course, spot.look.u, sign * kernel)
+            born = set_out(tracer, itinerary, spot.look.u, sign * kernel)
             if born is not None:
-                halves.append(Half(born, curve, 1, side_of(born, spot, curve)))
+                halves.append(Departure(born, curve, 1, side_of(born, spot, curve)))
                 break
     if len(halves) != 2:
         return None
     halves[0].partner, halves[1].partner = halves[1], halves[0]
     switch = curve.model.switches[slot.switch].name
-    made = OrbitBifurcation.repelled(name, spot, curve, [told(h) for h in halves], (switch,))
+    made = OrbitBifurcation.repelled(name, spot, curve, [half_branch_of(h) for h in halves], (switch,))
     return Node(spot, int(curve.order), halves, made)
 
 
 def _end(tracer: OrbitTracer, name: str, zero: Zero) -> Node:
     """No orbit nearby beyond this point."""
-    course = zero.spot.course
+    itinerary = zero.spot.itinerary
     row = zero.test.row
-    slot = zero.test.slot if zero.test.kind == "guard" else int(course.slot[row])
+    slot = zero.test.slot if zero.test.kind == "guard" else int(itinerary.slot[row])
     switch = tracer.curve.model.switches[tracer.curve.model.slots[slot].switch].name
     made = OrbitBifurcation.end(name, zero.spot, tracer.curve, (switch,), zero.side)
     return Node(zero.spot, int(tracer.curve.order), [], made)

@@ -10,10 +10,10 @@ import numpy as np
 
 from ....maps._corner_normal_form import CornerMap, Cycle
 from ....orbits.segments._equations import OrbitCurve
-from ....orbits.segments._itinerary import EventRecord, same_course, Start, starts_from
-from .._branch_switching import admissible, Half, together, tracer_for, with_order
+from ....orbits.segments._itinerary import EventRecord, same_itinerary, Start, starts_from
+from .._branch_switching import admissible, Departure, together, tracer_for, with_order
 from .._test_functions import PASSED
-from .._tracer import Arc, OrbitPoint, OrbitTracer, turned
+from .._tracer import OrbitPoint, OrbitTracer, Trace, turned
 from ._grazing import exactly
 from ._return_map import Base, follow, frame
 
@@ -24,7 +24,9 @@ BACK = 40  # points from there to the corner
 NEIGHBOUR = 1e-5  # at which the corner is known again
 
 
-def half_of(tracer: OrbitTracer, spot: OrbitPoint, corner: CornerMap, points: list[Base], cycle: Cycle) -> Half | None:
+def half_of(
+    tracer: OrbitTracer, spot: OrbitPoint, corner: CornerMap, points: list[Base], cycle: Cycle
+) -> Departure | None:
     """The orbit that a cycle of the normal form foretells, a little way off: piece by piece by the flow, which finds
     its itinerary, and then corrected."""
     own = tracer_for(tracer, with_order(tracer.curve, int(tracer.curve.order) * cycle.laps))
@@ -36,7 +38,7 @@ def half_of(tracer: OrbitTracer, spot: OrbitPoint, corner: CornerMap, points: li
             continue
         found = _beside(own, spot, found if float(found.look.tangent[-1]) * cycle.side >= 0 else turned(found))
         if found is not None:
-            return Half(found, own.curve, cycle.laps, cycle.side, cycle)
+            return Departure(found, own.curve, cycle.laps, cycle.side, cycle)
     return None
 
 
@@ -54,12 +56,12 @@ def _entered(
     """Corrected across the way on which the foretold orbits lie: at one parameter there may be none, where the branch
     turns round next to the corner."""
     curve = tracer.curve
-    near, far = (_foretold(curve, spot, points, cycle, share * distance) for share in (0.5, 1.0))
-    if near is None or far is None or not same_course(near.course, far.course):
+    near, far = (_predicted(curve, spot, points, cycle, share * distance) for share in (0.5, 1.0))
+    if near is None or far is None or not same_itinerary(near.itinerary, far.itinerary):
         return None
     values = [spot.parameter + cycle.side * share * distance * float(curve.width) for share in (0.5, 1.0)]
     before, guess = (curve.pack(s.filled(), v) for s, v in zip((near, far), values))
-    return tracer.corrected(far.filled().course, guess, (guess - before) / np.linalg.norm(guess - before))
+    return tracer.orbit_near(far.filled().itinerary, guess, (guess - before) / np.linalg.norm(guess - before))
 
 
 def _beside(tracer: OrbitTracer, at: OrbitPoint, found: OrbitPoint) -> OrbitPoint | None:
@@ -67,26 +69,26 @@ def _beside(tracer: OrbitTracer, at: OrbitPoint, found: OrbitPoint) -> OrbitPoin
     away from the corner; None if the way does not come there."""
     short = dataclasses.replace(tracer, max_points=BACK)
     for back in (turned(found), found):
-        arc, passed = Arc((back,)), []  # at which points something else is
-        while not arc.over:
-            arc = short.further(arc)
-            if arc.at is not None and arc.at.test.kind in PASSED:
-                passed.append(len(arc.spots) - 1)
-        end = None if arc.end is None else exactly(tracer, arc.end)
+        trace, passed = Trace((back,)), []  # at which points something else is
+        while not trace.over:
+            trace = short.further(trace)
+            if trace.at is not None and trace.at.test.kind in PASSED:
+                passed.append(len(trace.spots) - 1)
+        end = None if trace.end is None else exactly(tracer, trace.end)
         if end is None or not together(end.spot, at, tracer.curve, NEIGHBOUR):
             continue
         if not passed:
             return turned(back)
-        last, final = arc.spots[-2:]
-        if passed[-1] < len(arc.spots) - 2:
+        last, final = trace.spots[-2:]
+        if passed[-1] < len(trace.spots) - 2:
             return turned(last)
         way = final.look.u - last.look.u
-        between = tracer.corrected(found.course, last.look.u + way / 2, way / np.linalg.norm(way))
+        between = tracer.orbit_near(found.itinerary, last.look.u + way / 2, way / np.linalg.norm(way))
         return None if between is None else turned(between)
     return None
 
 
-def _foretold(curve: OrbitCurve, spot: OrbitPoint, points: list[Base], cycle: Cycle, distance: float) -> Start | None:
+def _predicted(curve: OrbitCurve, spot: OrbitPoint, points: list[Base], cycle: Cycle, distance: float) -> Start | None:
     m, period = len(points), float(spot.look.period)
     count = m * cycle.laps
     sizes = np.asarray(curve.sizes)

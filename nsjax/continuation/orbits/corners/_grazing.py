@@ -9,7 +9,7 @@ import numpy as np
 
 from ...._numerics._bracket import bracketed
 from ....orbits.segments._equations import OrbitCurve
-from ....orbits.segments._itinerary import capacity_for, Course, EVENT, GRAZING, Start, TIME
+from ....orbits.segments._itinerary import capacity_for, EVENT, GRAZING, OrbitItinerary, Start, TIME
 from ....system._impact import impact
 from .._test_functions import Test
 from .._tracer import alike, OrbitPoint, OrbitTracer, Zero
@@ -29,7 +29,7 @@ def exactly(tracer: OrbitTracer, zero: Zero) -> Zero | None:
 def touching_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
     """Where segments beyond a surface vanish because orbits only graze it: both ends come to it tangentially, and the
     equations are singular. Those without these segments, but with cuts, are not. None if it is nothing like that."""
-    curve, look, c, n = tracer.curve, zero.spot.look, zero.spot.course, int(zero.spot.course.num)
+    curve, look, c, n = tracer.curve, zero.spot.look, zero.spot.itinerary, int(zero.spot.itinerary.num)
     slots, length = curve.model.slots, np.asarray(look.end) - np.asarray(look.begin)
     size = np.asarray(curve.guard_sizes)[np.asarray(c.slot)] / float(curve.time) if slots else 1.0
     slow = np.abs(look.rates) < TANGENTIAL * size
@@ -54,11 +54,11 @@ def touching_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
         return None
     kept = [i for i in range(n) if i not in gone]
     targets = [kept.index(i) for i in before]
-    course = c.take(kept, capacity_for(len(kept)))
-    ends = np.array(course.ends)
+    itinerary = c.take(kept, capacity_for(len(kept)))
+    ends = np.array(itinerary.ends)
     ends[targets] = GRAZING
-    start = Start(course._replace(ends=ends), look.begin[kept], look.end[kept], look.x[kept])
-    at = tracer.corrected(start.course, curve.pack(start, zero.spot.parameter))
+    start = Start(itinerary._replace(ends=ends), look.begin[kept], look.end[kept], look.x[kept])
+    at = tracer.orbit_near(start.itinerary, curve.pack(start, zero.spot.parameter))
     found = None if at is None else _zero_along(tracer, at, targets[0])
     if found is None or abs(found.parameter - zero.spot.parameter) > FOUND * float(curve.width):
         return None
@@ -72,7 +72,7 @@ def grazing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
     """The orbit at which the least value of a guard along a segment is zero: cut there, that is a smooth equation. Its
     tests are the segments that end with the cuts."""
     spot = zero.spot
-    least, where, n = spot.look.least, spot.look.where, int(spot.course.num)
+    least, where, n = spot.look.least, spot.look.where, int(spot.itinerary.num)
     # Least values are those of samples; what turns out not to vanish is left out again.
     near = np.maximum(0.05 * spot.look.most, 10 * abs(least[zero.test.row, zero.test.slot]))
     both = [(i, j) for i, j in np.argwhere(least < near).tolist() if i < n and 0.002 < where[i, j] < 0.998]
@@ -97,20 +97,20 @@ def grazing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
 def _cut(tracer: OrbitTracer, spot: OrbitPoint, cuts: list[tuple[int, int]]) -> tuple[OrbitPoint, list[int]] | None:
     """The orbit with cuts where these guards are least along these segments, at the parameter at which the first of
     them vanishes; and the segments that end with the cuts."""
-    start, by_cut = cut_course(tracer.curve, spot, cuts)
-    at = tracer.corrected(start.course, tracer.curve.pack(start, spot.parameter))
+    start, by_cut = cut_itinerary(tracer.curve, spot, cuts)
+    at = tracer.orbit_near(start.itinerary, tracer.curve.pack(start, spot.parameter))
     if at is None:
         return None
     found = _zero_along(tracer, at, by_cut[cuts[0]])
     return None if found is None else (found, [by_cut[pair] for pair in cuts])
 
 
-def cut_course(
+def cut_itinerary(
     curve: OrbitCurve, spot: OrbitPoint, cuts: list[tuple[int, int]]
 ) -> tuple[Start, dict[tuple[int, int], int]]:
     """An orbit cut where these guards are least along these segments; and which segment ends with which cut."""
-    look, n = spot.look, int(spot.course.num)
-    c = spot.course
+    look, n = spot.look, int(spot.itinerary.num)
+    c = spot.itinerary
     whole = c.ends[0] == TIME
     rows: list[Any] = []
     order: dict[tuple[int, int], int] = {}
@@ -132,15 +132,15 @@ def cut_course(
         rows[0] = (*first[:5], last[5] - period, first[6], last[7])
     mode, part, ends, slot, entry, begins, stops, xs = (np.array(column) for column in zip(*rows))
     ends, slot, entry = (column.astype(np.int32) for column in (ends, slot, entry))
-    course = Course(mode, part, ends, slot, entry, np.asarray(len(rows), np.int32))
-    start = Start(course, begins, stops, xs).filled()
+    itinerary = OrbitItinerary(mode, part, ends, slot, entry, np.asarray(len(rows), np.int32))
+    start = Start(itinerary, begins, stops, xs).filled()
     return start, order
 
 
-def _component(curve: OrbitCurve, look: Any, course: Course, i: int, j: int, t: float) -> int:
+def _component(curve: OrbitCurve, look: Any, itinerary: OrbitItinerary, i: int, j: int, t: float) -> int:
     """Of a guard with several components that which is least there: at a tip another one takes over."""
     model = curve.model.with_parameter(curve.path, jnp.asarray(look.parameter))
-    state = curve.state(jnp.asarray(course.mode[i]), jnp.asarray(course.part[i]))
+    state = curve.state(jnp.asarray(itinerary.mode[i]), jnp.asarray(itinerary.part[i]))
     at = jnp.asarray(look.spots[i, j])
     when = jnp.asarray(t)
     values = np.asarray(curve.guards(model, when, at, state))[j]

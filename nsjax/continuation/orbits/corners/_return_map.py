@@ -85,7 +85,7 @@ def follow(
 
 def bases(curve: OrbitCurve, spot: Any, touches: list[Touch]) -> list[Base]:
     """One before each place, in the middle of the longest segment there that no surface holds."""
-    n, m, period = int(spot.course.num), len(touches), float(spot.look.period)
+    n, m, period = int(spot.itinerary.num), len(touches), float(spot.look.period)
     out = []
     for p, touch in enumerate(touches):
         before = touches[p - 1].row if m > 1 else touch.row
