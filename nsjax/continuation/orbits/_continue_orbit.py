@@ -265,7 +265,7 @@ class OrbitContinuation(Generic[StateT]):
         if plain(repr(integrator)) != archive.part("integrator"):
             raise ValueError(
                 "Arguments `solver`, `stepsize_controller` and `max_steps` must be those with which the branch was "
-                f"begun, {archive.part('how')}, but are {plain(repr(integrator))}."
+                f"begun, {archive.part('integrator')}, but are {plain(repr(integrator))}."
             )
         recorder = Recorder(record or {})
         if sorted(recorder.measures) != archive.part("record"):

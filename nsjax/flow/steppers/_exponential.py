@@ -21,7 +21,7 @@ from ..._numerics._series import Series
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
-from ._stepper import bernstein, jittered, stack, Step, Stepper, unresolved, Watch, with_multipliers
+from ._stepper import bernstein, jittered, stack, Step, Stepper, unresolved, Watched, with_multipliers
 
 
 _N = 10  # a step is sampled at so many equal parts; the polynomial through them is its dense output
@@ -251,14 +251,7 @@ class ExponentialStepper(Stepper):
         return ExponentialStepper(self.solver, slides)
 
     def __call__(
-        self,
-        model: SwitchedSystem,
-        state: ModeState,
-        t: Scalar,
-        t_next: Scalar,
-        y: Y,
-        f0: Y,
-        watch: Watch | None = None,
+        self, model: SwitchedSystem, state: ModeState, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watched = None
     ) -> Step:
         force = model.force(t, y, state) if self.slides and model.holdable else None
         ys, _, excess, fits = _sampled(lambda t, y: model.flow(t, y, state), t, t_next - t, y, f0, force)

@@ -8,7 +8,7 @@ import abc
 import functools as ft
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax as dfx
 import equinox as eqx
@@ -87,6 +87,9 @@ class Watch(NamedTuple):
     controller: dfx.AbstractStepSizeController
 
 
+Watched: TypeAlias = Watch | None
+
+
 class Stepper(eqx.Module):
     """Takes steps with `solver`.
 
@@ -103,14 +106,7 @@ class Stepper(eqx.Module):
 
     @abc.abstractmethod
     def __call__(
-        self,
-        model: SwitchedSystem,
-        state: ModeState,
-        t: Scalar,
-        t_next: Scalar,
-        y: Y,
-        f0: Y,
-        watch: Watch | None = None,
+        self, model: SwitchedSystem, state: ModeState, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watched = None
     ) -> Step:
         """A step from `t`, where the field is `f0`, to `t_next`.
 
@@ -175,14 +171,7 @@ class RungeKutta(Stepper):
         self.degree = _dense_weights(type(solver), self.stages, _double())[1]
 
     def __call__(
-        self,
-        model: SwitchedSystem,
-        state: ModeState,
-        t: Scalar,
-        t_next: Scalar,
-        y: Y,
-        f0: Y,
-        watch: Watch | None = None,
+        self, model: SwitchedSystem, state: ModeState, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watched = None
     ) -> Step:
         step = self.step(model, state, t, t_next, y, f0)
         if watch is None or not model.slots:

@@ -18,7 +18,7 @@ from ..._numerics._series import Coefficient, Series
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
-from ._stepper import jittered, Step, Stepper, unresolved, Watch, with_multipliers
+from ._stepper import jittered, Step, Stepper, unresolved, Watched, with_multipliers
 
 
 class _Polynomial(dfx.AbstractLocalInterpolation):
@@ -169,14 +169,7 @@ class TaylorStepper(Stepper):
         self.degree = solver.terms
 
     def __call__(
-        self,
-        model: SwitchedSystem,
-        state: ModeState,
-        t: Scalar,
-        t_next: Scalar,
-        y: Y,
-        f0: Y,
-        watch: Watch | None = None,
+        self, model: SwitchedSystem, state: ModeState, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watched = None
     ) -> Step:
         leaves, tree = jax.tree.flatten(y)
         which = model.holdable
