@@ -217,7 +217,7 @@ def _reference(system: System, quantity: Any, max_steps: int) -> tuple[np.ndarra
 
 
 def _timed(run: Callable[[], Any], repeats: int) -> tuple[float, Any, str]:
-    """Median seconds, the value, and why there is none."""
+    """Median seconds, the value, or why it is missing."""
     seconds, value = [], None
     log = logging.getLogger("jax._src.callback")
     level, failure = log.level, ""

@@ -87,6 +87,6 @@ def _call_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
         return smooth, (smooth, arrays)
 
     kept: list[Any] = []
-    # Leaf by leaf: the Jacobian of a result that nobody uses is never computed.
+    # Leaf by leaf: the Jacobian of a result that is not used is never computed.
     matrices, (smooth, arrays) = jax.jacfwd(flat, has_aux=True)(x)
     return eqx.combine(smooth, arrays, kept[0]), jax.tree.map(lambda m: jnp.dot(m, dx.astype(m.dtype)), matrices)

@@ -181,7 +181,7 @@ def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar
     """The earliest u in [0, 1] at which the maximum of the polynomials over the parts is no longer positive.
 
     Walks through dyadic intervals from the left: one without a root is passed, one with exactly one is done, any other
-    is halved. A root that so many halvings do not separate from its neighbour (a double root) is reported where it is.
+    is halved. A root that these halvings do not separate from its neighbour (a double root) is reported where it is.
 
     **Returns:** whether there is one, and its place (1 if there is none).
     """

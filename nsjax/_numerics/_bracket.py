@@ -1,4 +1,4 @@
-"""Roots along a curve whose points are dear: each is computed once, and kept."""
+"""Roots along a curve whose points are expensive: each is computed once and kept."""
 
 from collections.abc import Callable
 from typing import TypeVar

@@ -32,7 +32,7 @@ def find_root(
     """A root of `residual(z, parameters)` by optimistix's Newton method, and whether it converged.
 
     The root's derivatives with respect to the parameters, of every order, are those of the implicit function. They are
-    not numbers where there is no root, or where it is not regular: optimistix's own rule raises an error there, which
+    NaN where there is no root, or where it is not regular: optimistix's own rule raises an error there, which
     one bad lane of a batch would do for all. Where roots may not be isolated (`well_posed=False`) the steps are the
     shortest ones.
     """

@@ -44,7 +44,7 @@ def known(tree: Any) -> bool:
 
 
 def components(y: Y, axes: int = 0) -> list[tuple[str, Any]]:
-    """The numbers of a state with their names; of many states, whose leaves have so many leading axes, arrays."""
+    """The numbers of a state with their names; of many states, whose leaves have `ndim` leading axes, arrays."""
     out = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(y):
         name = jax.tree_util.keystr(path, simple=True, separator=".") or "y"

@@ -2,7 +2,7 @@
 
 The file is an `.npz` without pickled objects: the arrays, end to end, one vector for each dtype; and a text in JSON
 that says how the results are made of them. An object that occurs in several places is one object again. What belongs
-to the user, a model and the structure of its states, is not in the file but for its numbers: whoever reads it has the
+to the user, a model and the structure of its states, is in the file by its numbers only: whoever reads it has the
 model.
 """
 
@@ -86,7 +86,7 @@ class Archive:
     - `y`: a state, whose numbers do not matter. Without it a state is what the model's vector field returns, or made
         of dictionaries, tuples and NamedTuples.
 
-    **Raises:** `ValueError` for a file that is none of these, is damaged, is of another format, or of another model.
+    **Raises:** `ValueError` for a file of another kind, one that is damaged, is of another format, or of another model.
     """
 
     system: System
@@ -243,7 +243,7 @@ def plain(text: str) -> str:
 
 
 def signature(system: System) -> str:
-    """What a model is, but for the numbers: its class, its parameters and their shapes, what is static in it."""
+    """What a model is, apart from the numbers: its class, its parameters and their shapes, what is static in it."""
     return plain(eqx.tree_pformat(system))
 
 

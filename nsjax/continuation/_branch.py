@@ -63,7 +63,7 @@ class AbstractBranch(eqx.Module):
         - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
             NamedTuples.
 
-        **Raises:** `ValueError` for a file that is damaged, is none of `save`'s, or is of another model.
+        **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model.
         """
         return Archive(path, cls.__name__, cls.saved, system, y).part("branch")
 

@@ -20,7 +20,7 @@ class AbstractHalfBranch(eqx.Module):
 
 
 class AbstractSpecialPoint(eqx.Module):
-    """A bifurcation, or a place that is none though it looks like one; see `Bifurcation` and `OrbitBifurcation`."""
+    """A bifurcation, or a place that only looks like one; see `Bifurcation` and `OrbitBifurcation`."""
 
     plain: ClassVar[dict[str, str]]  # kinds that are no bifurcations, and how they are named
 

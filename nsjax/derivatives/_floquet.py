@@ -29,7 +29,7 @@ def product(factors: Float[Array, "factors n n"]) -> Float[Array, "n n"]:
 
 
 def _triangular(factors: Float[Array, "factors n n"]) -> Float[Array, "n n"]:
-    """A matrix similar to the product, triangular but for what belongs together.
+    """A matrix similar to the product, triangular apart from blocks of eigenvalues of nearly one modulus.
 
     The product itself rounds its small eigenvalues to those of a matrix as large as its largest. Orthogonal iteration
     around the cycle (the unshifted form of the periodic QR algorithm) turns every factor to triangular form, whose

@@ -72,7 +72,7 @@ def _held(model: SwitchedSystem, t: Scalar, y: Y, mode: tuple) -> Y:
 
 
 class _Jump(NamedTuple):
-    """An event of one switch, linearised; R is the identity but for impacts."""
+    """An event of one switch, linearised; R is the identity unless it is an impact."""
 
     n: Float[Array, " n"]
     h_t: Scalar
@@ -124,7 +124,7 @@ def _part(x: Array) -> Array:
 
 
 def _unless_rounding(x: Array, blur: Array) -> Array:
-    """Zero where terms cancel, but for their rounding; the derivative stays, as they need not cancel next to it."""
+    """Zero where terms cancel apart from their rounding; the derivative stays, as they need not cancel next to it."""
     return x - lax.stop_gradient(jnp.where(jnp.abs(x) < blur, x, 0))
 
 

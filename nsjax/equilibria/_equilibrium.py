@@ -197,7 +197,7 @@ def linear_motion(
 
 
 def free_eigenvalues(motion: Float[Array, "n n"], held: Int[Array, ""]) -> Complex[Array, " n"]:
-    """Largest real part first; those off the surfaces come last, and are not numbers."""
+    """Largest real part first; those off the surfaces come last, and are NaN."""
     roots = eigenvalues(motion)
     order = jnp.argsort(-lax.stop_gradient(roots).real)
     return jnp.where(_free(len(roots), held), roots[order], jnp.nan)

@@ -23,7 +23,7 @@ from ..system._system import arrays_of, System
 from ._equilibrium import Equilibrium, equilibrium_in
 
 
-MODES = 729  # so many modes at most are tried one by one
+MODES = 729  # the largest number of modes that are tried one by one
 
 
 def find_equilibrium(

@@ -77,7 +77,7 @@ class Flow(eqx.Module):
     t1: Scalar
     max_steps: int = eqx.field(static=True)
     max_events: int = eqx.field(static=True)
-    keep_steps: int = eqx.field(static=True)  # every so many steps are saved
+    keep_steps: int = eqx.field(static=True)  # save every n-th step
     want_points: bool = eqx.field(static=True)
     meter: dfx.AbstractProgressMeter
     affine: tuple[bool, ...] = eqx.field(static=True)  # whether each guard is affine in (t, y)
@@ -86,7 +86,7 @@ class Flow(eqx.Module):
 
     @property
     def tolerance(self) -> tuple[Any, Any]:
-        """Relative and absolute, of a step; not numbers for steps of a given length."""
+        """Relative and absolute, of a step; NaN for steps of a given length."""
         return getattr(self.controller, "rtol", jnp.nan), getattr(self.controller, "atol", jnp.nan)
 
     def land(self, step: Interval, touches: list) -> Transition:
@@ -140,7 +140,7 @@ class Flow(eqx.Module):
             touching = ft.reduce(jnp.logical_or, [part for row in touches for part in row])
             busy = c.active & keep & is_finite & ((~quiet & ahead) | touching)
         if self.reverse:
-            # The derivatives of a rejected step that overflows are no numbers, and zero times that is none either.
+            # The derivatives of a rejected step that overflows are infinite or NaN, and so is zero times that.
             again = stepper(model, c.state, c.t, jnp.where(keep, t_next, c.t), c.y, c.f)
             step = step._replace(t_next=again.t_next, y1=again.y1, ks=again.ks, slope=again.slope)
         return _Attempt(step, keep & c.active, dt, halvings, controller, result, busy, touches)

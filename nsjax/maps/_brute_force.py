@@ -31,7 +31,7 @@ class BruteForce(eqx.Module):
     - `parameter`: its name.
     - `values`: its values, shape `(values,)`.
     - `ts`: times of the points [time], shape `(values, starts, keep)`.
-    - `ys`: the points, states whose leaves have these three leading axes; not numbers from where a solution fails.
+    - `ys`: the points, states whose leaves have these three leading axes; NaN from where a solution fails.
     - `result`: `RESULTS`, shape `(values, starts)`.
     """
 
@@ -53,7 +53,7 @@ class BruteForce(eqx.Module):
 
     def periods(self, tol: float = 1e-4) -> np.ndarray:
         """After how many points each solution repeats itself: 0 where it does not within half of those kept, as in
-        chaos, -1 where there are no numbers.
+        chaos, -1 where a solution failed.
 
         **Arguments:**
 

@@ -98,7 +98,7 @@ class Cycles(NamedTuple):
     words: int
 
     def on(self, side: int, laps: int | None = None) -> tuple[Cycle, ...]:
-        """Those on one side, -1 or +1; of so many laps."""
+        """Those on one side, -1 or +1, of `laps` laps."""
         return tuple(c for c in self.cycles if c.side == side and laps in (None, c.laps))
 
 
@@ -108,7 +108,7 @@ class CornerKind(NamedTuple):
     **Attributes:**
 
     - `kind`: "none", "fold", "flip", "fold-flip", "symmetry breaking", "transcritical"; "multiple crossing" if there
-        are longer cycles, but not by a flip; or "3 to 1": so many orbits of one lap below and above.
+        are longer cycles, but not by a flip; or "3 to 1": the numbers of orbits of one lap below and above.
     - `criticality`: of what is born at a flip or where a symmetry breaks: "supercritical" if any of it is stable, or
         less unstable than the orbit of one lap beside it, "subcritical" if all is more unstable; None if neither is so,
         as when all are unstable alike. At a fold-flip "supercritical" if a longer cycle is stable, or None.
@@ -129,8 +129,8 @@ def find_cycles(corner: CornerMap, most: int = 8, *, symmetry: np.ndarray | None
     **Arguments:**
 
     - `corner`: the normal form; see `CornerMap`.
-    - `most`: cycles of up to so many laps; of fewer if that were more than some 4000 words (7 laps for m = 2, 4 for
-        m = 3, 3 for m = 4).
+    - `most`: the largest number of laps of a cycle; fewer if that were more than about 4000 words (7 laps for m = 2, 4
+        for m = 3, 3 for m = 4).
     - `symmetry`: J, (n, n), an involution: if x is before place p then J x is before place p + m/2, on an orbit of the
         same system. None if there is none.
     - `rtol`: to how many digits the normal form is known: what an error of this size could undo is reported as

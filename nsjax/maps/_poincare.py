@@ -47,7 +47,7 @@ class Iterate(NamedTuple):
     **Attributes:**
 
     - `t`: its time [time].
-    - `y`: the state there; not numbers where there is none.
+    - `y`: the state there; NaN where there is none.
     - `mode`: one value for each switch, as `mode=` of `poincare_map` and `solve` takes it.
     - `result`: `RESULTS`.
     """
@@ -179,7 +179,7 @@ class PoincareMap(eqx.Module):
             t, y, mode, result = here
             given = {name: mode[k] for k, name in enumerate(names) if start.named[k]}
             later, y, mode, now = self.once(system, t, start.t0, y, given)
-            # What has failed stays failed; it goes on from states that are no numbers, which takes no step.
+            # What has failed stays failed; it goes on from NaN, which takes no step.
             result = RESULTS.where(is_okay(result) & (now != RESULTS.successful), now, result)
             return jnp.where(is_okay(result), later, t), unless_failed(result, y), mode, result
 
@@ -255,7 +255,7 @@ class _Phase(PoincareMap):
 
 
 def unless_failed(result: RESULTS, tree: Any) -> Any:
-    """`tree`, or what are no numbers, nor their derivatives."""
+    """`tree`, or NaN, derivatives included."""
     return jax.tree.map(lambda x: x * jnp.where(is_okay(result), 1, jnp.nan).astype(x.dtype), tree)
 
 
@@ -397,7 +397,7 @@ def poincare_map(
     - `y0`: the state at `t0`, on the section or not.
     - `direction`: 1 to count crossings where h rises, -1 where it falls, 0 for both. Of a `sgn` switch, crossings to
         that side, and 0 for all of its events; of a relay 1 where it switches on, -1 off; of an impact 1 or 0.
-    - `number`: the how-manieth crossing: that power of the map.
+    - `number`: which crossing, counted from 1: that power of the map.
     - `iterates`: how many iterates, which then have a leading axis; by default one, without.
     - `max_time`: how long each return may take [time]; forced systems: by default a hundred periods.
     - `t0`, `mode`, `solver`, `stepsize_controller`, `max_events`, `adjoint`: as for `solve`. `max_steps`: for each

@@ -29,7 +29,7 @@ class ReducedIterate(NamedTuple):
 
     - `value`: the component after `order` periods.
     - `y`: the state at the start: the given value of the component, and the others, which are periodic.
-    - `result`: `RESULTS`; where it is a failure the others are not numbers.
+    - `result`: `RESULTS`; where it is a failure the others are NaN.
     """
 
     value: Scalar
@@ -123,7 +123,7 @@ def reduced_map(
 
 
 class _Span(NamedTuple):
-    """How a solution is followed over so many periods of the forcing."""
+    """How a solution is followed over `order` periods of the forcing."""
 
     mode: Any
     order: int

@@ -96,7 +96,7 @@ def find_orbit(
     - `adjoint`: `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`; for `jax.grad` and `jax.linearize` (and so for
         optimistix's optimisers) `diffrax.DirectAdjoint()`, at the cost of a forward derivative for each parameter that
         is perturbed.
-    - `throw`: whether a failure raises; if not, look at `Orbit.result`. Derivatives are not numbers where there is no
+    - `throw`: whether a failure raises; if not, look at `Orbit.result`. Derivatives are NaN where there is no
         orbit.
 
     **Returns:** an `Orbit`. Its result is `RESULTS.tangential_event`, which is no failure, if it grazes a surface: the

@@ -177,7 +177,7 @@ def repeats_held(
 def _laps(
     system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrator: Integrator, number: int
 ) -> tuple[Y, tuple, Float[Array, "laps n"]]:
-    """A solution of a forced system after so many periods, its mode, and its states after each. The bounds of
+    """A solution of a forced system after `number` periods, its mode, and its states after each. The bounds of
     `integrator` are those of one period."""
     end = t0 + sign * jnp.asarray(system.period, t0.dtype)
 

@@ -73,7 +73,7 @@ class Orbit(eqx.Module, Generic[StateT]):
 
     @property
     def monodromy_jumps(self) -> Float[Array, "events n n"]:
-        """The saltation matrices by which the fundamental matrix jumps at `events`; not numbers past the last."""
+        """The saltation matrices by which the fundamental matrix jumps at `events`; NaN past the last."""
         return saltation_matrices(self.system, self.events)
 
     @property

@@ -121,7 +121,7 @@ class Search(NamedTuple):
         return orbit
 
     def _once(self, system: System, y0: Y, period: Scalar, order: int, mode: Any, pieces: int | None) -> Orbit:
-        """By shooting, or by segments in so many pieces."""
+        """By shooting, or by segments, each in `pieces` pieces."""
         t0, integrator = self.t0, self.integrator
         if pieces is None:
             shooting = Shooting(order, self.symmetry, self.backward, integrator, self.newton)

@@ -42,7 +42,7 @@ def mark(ax: "Axes", x: float, y: float, discontinuous: bool, bifurcation: bool)
 
 
 def wording(name: str, keep: bool = False) -> str:
-    """The name of a bifurcation, short and in lines; whole if it is none."""
+    """The name of a bifurcation, short and in lines; whole if it is no bifurcation."""
     text = name.partition(":")[0].replace("discontinuous ", "discontinuous\n").replace(" bifurcation, ", ",\n")
     return text if keep else text.removesuffix(" bifurcation")
 

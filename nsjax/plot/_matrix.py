@@ -84,7 +84,7 @@ def multipliers(orbit: Any, *, ax: "Axes | None" = None) -> "Axes":
     if not orbits:
         raise ValueError("Argument `orbit` must be an orbit or a sequence of them, but is empty.")
     if any(np.isnan(np.asarray(each.multipliers)).any() for each in orbits):
-        raise ValueError("Argument `orbit` must be an orbit that was found, but its multipliers are not numbers.")
+        raise ValueError("Argument `orbit` must be an orbit that was found, but its multipliers are NaN.")
     ax = axes_or_new(ax)
     angle = np.linspace(0, 2 * np.pi, 361)
     ax.plot(np.cos(angle), np.sin(angle), color="0.5", linewidth=1.0)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 DIAGONAL = dict(color="0.6", linewidth=0.9, zorder=1)
 COBWEB = dict(color="C1", linewidth=0.9, zorder=2)
 POINT = dict(linestyle="none", marker="o", markersize=6, markeredgecolor="black", zorder=4)
-STEEP = 5.0  # a slope between samples so many times those beside it is a jump
+STEEP = 5.0  # how many times the slopes beside it a slope is that counts as a jump
 DOTS = dict(linestyle="none", marker=".", markersize=1.2, color="0.25", zorder=1, rasterized=True)
 
 

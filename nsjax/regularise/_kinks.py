@@ -238,7 +238,7 @@ def mark_kinks(system: System, y0: Y) -> System:
     bent = tuple(n for n in new if not is_affine(lambda s: marked._field(t, y, zeros | {n: s}), zero))
     if len(bent) > _MOST:
         raise ValueError(
-            f"{field} must be affine in its kinks, but for {_MOST}, and is not in {', '.join(bent)}. Use them as terms "
-            "or factors: not inside a function, in a power, or in a denominator."
+            f"{field} must be affine in all but {_MOST} of its kinks, and is not in {', '.join(bent)}. Use them as "
+            "terms or factors: not inside a function, in a power, or in a denominator."
         )
     return Marked(system, marked.kinks, bent)

@@ -103,7 +103,7 @@ def eigenvalue_crossings(
     - `multipliers`: whether the unit circle is meant, not the axis.
     - `along`: two surfaces only: the ends `((q1, q2), (q1, q2))` of a line in the square, to find all crossings along
         it: `((0.3, 0), (0.3, 1))` for all q2 at q1 = 0.3.
-    - `lines`: two surfaces only: with so many lines each way across the square the curves are drawn.
+    - `lines`: two surfaces only: the number of lines each way across the square with which the curves are drawn.
 
     **Returns:** for one surface, or along a line, a list of `EigenvalueCrossing` in the order of `q`. For two surfaces
     `EigenvalueCurves`: polylines whose vertices are exact, and exactly where they meet the edges and diagonals of the
@@ -145,8 +145,8 @@ def eigenvalue_path(
     **Arguments:**
 
     - `j_minus`, `j_plus`, `multipliers`: as for `eigenvalue_crossings`.
-    - `points`: at least so many values of q. There are more where eigenvalues move fast: where they collide, and turn
-        from the real axis into the plane.
+    - `points`: the least number of values of q. There are more where eigenvalues move fast: where they collide and
+        leave the real axis.
 
     **Returns:** an `EigenvaluePath`.
 

@@ -345,7 +345,7 @@ def flat_jax(y):
 
 @pytest.mark.parametrize("a, v, c", [(1.0, 1.0, 0.0), (0.5, -2.0, 0.0), (1.3, 0.7, 0.1)])
 def test_every_restart_is_on_the_surface(a, v, c):
-    """Pitfalls 1, 2: h is exactly zero at the start and (but for c = 0.1) at every restart; no root is lost and none
+    """Pitfalls 1, 2: h is exactly zero at the start and (apart from c = 0.1) at every restart; no root is lost and none
     comes twice, and the derivatives of event times by parameters in field and surface are there."""
     flight = 2 * abs(v) / a
     jacobian, (out, num) = toggle()(jnp.asarray([a, v, c]), jnp.asarray(20.5 * flight))

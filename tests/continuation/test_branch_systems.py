@@ -271,7 +271,7 @@ def test_interval_begins_at_a_corner():
 
 
 def test_start_that_sticks():
-    """The base point lies on the surface, but for rounding: the orbit is as it is from elsewhere."""
+    """The base point lies on the surface, apart from rounding: the orbit is as it is from elsewhere."""
 
     class Dry(nsjax.System):
         omega: float = 0.45

@@ -286,7 +286,7 @@ class Relaxed(nsjax.System):
 
 
 def test_rest_without_force():
-    """After a plastic impact nothing moves and no force acts, but for their rounding, whatever its sign."""
+    """After a plastic impact nothing moves and no force acts, apart from their rounding, whatever its sign."""
 
     @jax.jit
     @jax.vmap

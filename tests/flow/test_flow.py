@@ -92,7 +92,7 @@ def test_scale_of_the_indicator_function_does_not_matter():
 
 
 def test_scale_does_not_matter_on_the_surface():
-    """Pitfall 27: who starts on the surface, but for an ulp, is on it in every unit of h, and who starts beside it not."""
+    """Pitfall 27: who starts on the surface, apart from an ulp, is on it in every unit of h, and who starts beside it not."""
     v = 0.2 + jnp.asarray([0.0, np.spacing(0.2), -np.spacing(0.2), 1e-9, -1e-9])
     scale = 10.0 ** jnp.asarray([0.0, -12.0, 12.0])
 

@@ -115,7 +115,7 @@ def test_random_clocks(direction):
 @pytest.mark.parametrize("name", SHAPES)
 @pytest.mark.parametrize("direction", [1, -1])
 def test_many_random_clocks(name, direction):
-    """Both ways in time, but for relays and impacts; the tally is printed."""
+    """Both ways in time, apart from relays and impacts; the tally is printed."""
     plain = SHAPES[name][0].plain
     if direction < 0 and plain.relay + plain.impact:
         pytest.skip("not of a unique past")

@@ -92,7 +92,7 @@ AUTONOMOUS = {  # a box of starts, a period, and whether it runs backwards; each
 FORCED = {  # parameters, order, and how many orbits of it are known: see `orbit_reference`
     "3.5": (gallery.DiscontinuousSupport, {}, 1, 1),
     "6.6": (gallery.Trilinear, {}, 1, 3),
-    "6.8": (gallery.ForcedFriction, {}, 1, 2),  # but for the mirrored one, whose multipliers are the same
+    "6.8": (gallery.ForcedFriction, {}, 1, 2),  # apart from the mirrored one, whose multipliers are the same
     "6.9": (gallery.ForcedStickSlip, dict(omega=1.68), 2, 4),
     "stop": (Stop, dict(omega=3.0), 2, 2),
 }

@@ -32,7 +32,7 @@ class Shot(NamedTuple):
 
     @property
     def stable(self) -> bool:
-        """All multipliers are inside the unit circle, but for the 1 of an autonomous system."""
+        """All multipliers are inside the unit circle, apart from the 1 of an autonomous system."""
         moduli = abs(self.multipliers)
         if self.guess_period is not None:
             moduli = np.delete(moduli, np.argmin(abs(self.multipliers - 1)))
@@ -292,7 +292,7 @@ FRICTION = {
 
 @cache
 def friction_orbit(which: str) -> Shot:
-    """Section 6.8, the orbits of Fig. 6.18 by name (a key of `FRICTION`), with the values of Appendix C.4 but for ω.
+    """Section 6.8, the orbits of Fig. 6.18 by name (a key of `FRICTION`), with the values of Appendix C.4 apart from ω.
 
     Branch I to the right of B at ω = 0.8 (never sticks, complex multipliers), between A and B at 0.65 (two stick
     phases, unstable), to the left of A at 0.58 and 0.51 (two). Branch II between B and C at 0.65 (one stick phase) with

@@ -60,7 +60,7 @@ class BifurcationCurve(eqx.Module):
     - `parameters`: their names.
     - `values`: shape `(points, 2)`.
     - `periods`: of the orbits [time].
-    - `multipliers`: shape `(points, n)`; at a corner those of one side, not numbers where they are limits only.
+    - `multipliers`: shape `(points, n)`; at a corner those of one side, NaN where they are limits only.
     - `ts`, `ys`: a time, and the state of each orbit then; leaves with a leading axis.
     - `special`: its points of codimension two, in their order.
     - `indices`: at which point of the curve each is.

@@ -104,7 +104,7 @@ class AbstractBifurcationTracer(abc.ABC):
     curve: OrbitCurve
     test: Test
     scale: float = 0.0
-    silent: frozenset[Test] = frozenset()  # test functions that are zero all along it, or no numbers
+    silent: frozenset[Test] = frozenset()  # test functions that are zero all along it, or NaN
 
     @abc.abstractmethod
     def place(self, spot: OrbitPoint, along: np.ndarray | None = None, heading: np.ndarray | None = None) -> Place:
@@ -130,7 +130,7 @@ class AbstractBifurcationTracer(abc.ABC):
         names = {t for row in rows for t in row}
         silent = {t for t in names if all(abs(row.get(t, 0.0)) < ALWAYS for row in rows)}
         if "rate" in {t.kind for t in (self.test, *silent)}:
-            silent |= {*CIRCLE}  # saltation matrices that are limits make them no numbers
+            silent |= {*CIRCLE}  # saltation matrices that are limits make them NaN
         return dataclasses.replace(self, silent=frozenset(silent))
 
 

@@ -45,14 +45,14 @@ class HalfBranch(AbstractHalfBranch):
 
 @shown
 class Bifurcation(AbstractSpecialPoint):
-    """A special point of a branch: a bifurcation, or a place that is none though it looks like one.
+    """A special point of a branch: a bifurcation, or a place that only looks like one.
 
     **Attributes:**
 
     - `kind`: "saddle-node", "transcritical", "pitchfork", "Hopf", or several of them at once, as "Hopf-pitchfork".
         "none" where the branch crosses a surface without bifurcation, "hysteresis point" where it is vertical without
         turning back (Fig. 5.1), "end" where there is no equilibrium beyond, "continuum" where there is one at this very
-        value of the parameter, "3 to 2" (so many below and above) for what has no name.
+        value of the parameter, "3 to 2" (the numbers below and above) for what has no name.
     - `discontinuous`: whether eigenvalues jump there: the point lies on surfaces of switches.
     - `criticality`: "supercritical", "subcritical", or None if the kind knows no such thing, or it is not known.
     - `evidence`: what supports the kind: "count" of the equilibria (Definition 5.1), "crossing" of the imaginary axis
@@ -69,7 +69,7 @@ class Bifurcation(AbstractSpecialPoint):
     - `places`: for each crossing, where it is between the sides of each surface: {name: q}, q = 0 where h < 0.
     - `halves`: the half-branches that meet there.
     - `period`: of the periodic orbits born there, at the point; None if there are none.
-    - `orbits`: how many of them were found below and above; None if nobody looked. See `hopf_orbits`.
+    - `orbits`: how many of them were found below and above; None if they were not looked for. See `hopf_orbits`.
     """
 
     plain = {

@@ -29,7 +29,7 @@ class Branch(AbstractBranch):
     - `values`: of the parameter, at each point.
     - `ys`: the states, leaves with a leading axis.
     - `modes`, `multipliers`: of the switches; shape `(points, switches)`.
-    - `eigenvalues`: shape `(points, n)`; not numbers for the directions that surfaces take.
+    - `eigenvalues`: shape `(points, n)`; NaN for the directions that surfaces take.
     - `unstable`: how many eigenvalues have positive real parts.
     - `stable`: whether all have negative ones, and surfaces that hold the point attract.
     - `special`: the special points on it, in their order: bifurcations, and what looks like one.

@@ -68,7 +68,7 @@ def continue_equilibrium(
         what it changes over the interval at the start's rate, or 1. Steps are measured in it, and in the interval.
     - `max_step`: the longest step.
     - `max_points`: of one branch; a branch that has more ends there, and says so in `Branch.ends`.
-    - `max_branches`: so many at most; if there are more a warning says so.
+    - `max_branches`: the largest number of branches; a warning says if there are more.
     - `t`: the time at which forces are taken.
 
     **Returns:** the `Branch` through the (first) start, with the others in `Branch.others`.
@@ -146,7 +146,7 @@ def _units(curve: EquilibriumCurve, places: list[tuple[Any, np.ndarray]], width:
 
 @dataclasses.dataclass
 class _Tree:
-    """The branches that hang together, found by following every half-branch of every node once."""
+    """Branches that meet one another, found by following every half-branch of every node once."""
 
     tracer: Tracer
     max_branches: int

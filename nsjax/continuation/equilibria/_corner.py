@@ -18,8 +18,8 @@ ACTIVE = 1e-8  # distance at which a point lies on a surface: it is located to s
 NEAR = 3e-8  # distance within which two points are one
 SINGULAR = 1e-8  # of the equations in units of what they are nearby
 PROBE = 1e-4  # length of the step by which a half-branch is tried: nothing is read off it but signs
-CONTINUUM = 1e-12  # change of the parameter in such a step that is none
-MODES = 6561  # so many combinations of sides are tried
+CONTINUUM = 1e-12  # a smaller change of the parameter in such a step counts as zero
+MODES = 6561  # the largest number of combinations of sides that are tried
 
 
 @dataclasses.dataclass

@@ -65,7 +65,7 @@ class OrbitBifurcation(AbstractSpecialPoint):
 
     - `kind`: "fold", "flip", "Neimark-Sacker", "symmetry breaking", "transcritical"; "fold-flip" where set-valued
         multipliers cross the circle at both 1 and -1 (section 6.9); "infinitely unstable fold" where one jumps from 0
-        to infinity (section 6.7); "multiple crossing", or "3 to 1" (so many orbits below and above) for what has no
+        to infinity (section 6.7); "multiple crossing", or "3 to 1" (the numbers below and above) for what has no
         name; "none" where the itinerary changes without a bifurcation, "end" where there is no orbit nearby beyond.
     - `discontinuous`: whether it is a corner: multipliers jump there.
     - `criticality`: "supercritical", "subcritical", or None if the kind knows no such thing.

@@ -99,7 +99,7 @@ def continue_orbit(
         (1 where that is less than 1e-9, as along x = 0).
     - `max_step`: the longest step, in units of `scale`, of the orbit's period, and of the interval.
     - `max_points`: of each trace between two special points.
-    - `max_branches`: so many at most; if there are more a warning says so.
+    - `max_branches`: the largest number of branches; a warning says if there are more.
     - `max_laps`: the longest period that is followed, over that of `orbit`.
     - `virtual`: whether to follow the segments of the orbits at each corner beyond it too, though the system has no
         such orbits there (to see what a corner cuts off, or Feigin's classification): as branches of their own in
@@ -157,7 +157,7 @@ class OrbitContinuation(Generic[StateT]):
     ```
 
     An interrupt (Ctrl-C), wherever it comes, leaves a growth that can be gone on with. The arguments are those of
-    `continue_orbit`, but for `progress`.
+    `continue_orbit` without `progress`.
     """
 
     def __init__(
@@ -257,8 +257,8 @@ class OrbitContinuation(Generic[StateT]):
             NamedTuples.
         - `record`, `solver`, `stepsize_controller`, `max_steps`: those with which it was begun.
 
-        **Raises:** `ValueError` for a file that is damaged, is none of `save`'s, or is of another model or solver,
-        or has other records.
+        **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model or solver
+        or with other records.
         """
         archive = Archive(path, "OrbitContinuation", TYPES, system, y)
         integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))

@@ -1,4 +1,4 @@
-"""The branches of periodic orbits that hang together, found by following every half-branch of every node once."""
+"""Branches of periodic orbits that meet one another, found by following every half-branch of every node once."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -85,7 +85,7 @@ class OrbitTree:
         return self.nodes[node].halves[number]
 
     def places(self) -> Iterator[Place]:
-        """Of half-branches that nobody has been on, and that do not leave the interval at once."""
+        """Half-branches that were not yet followed, and do not leave the interval at once."""
         every = ((i, j) for i, node in enumerate(self.nodes) for j in range(len(node.halves)))
         return (p for p in every if p not in self.used and 0 <= self.half(p).spot.look.u[-1] <= 1)
 

@@ -28,7 +28,7 @@ CIRCLE = (Test("flip"), Test("Neimark-Sacker"))
 
 
 def corner_tests(rows: int, slots: int) -> list[Test]:
-    """Of so many segments and guards, in the order of `corner_values`."""
+    """By the numbers of segments and guards, in the order of `corner_values`."""
     of_segments = [Test(kind, i) for kind in ("rate", "margin", "duration") for i in range(rows)]
     return of_segments + [Test("guard", i, j) for i in range(rows) for j in range(slots)]
 

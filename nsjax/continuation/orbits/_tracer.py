@@ -37,7 +37,7 @@ ASIDE = 1e-2  # from a branch point, in steps: a fold that is nearer is the bran
 
 @dataclasses.dataclass
 class OrbitPoint:
-    """A point of a branch: what is seen there, its itinerary, and its multipliers."""
+    """A point of a branch: the data of its orbit, its itinerary, and its multipliers."""
 
     look: PointData
     itinerary: OrbitItinerary
@@ -133,7 +133,7 @@ class Trace:
 
 @dataclasses.dataclass
 class OrbitTracer:
-    """Traces traces; virtual ones heed nothing but the ends of the interval."""
+    """Follows branches; virtual ones to the ends of the interval, whatever they meet."""
 
     curve: OrbitCurve
     max_step: float
@@ -284,7 +284,7 @@ class OrbitTracer:
         return [*out, last]
 
     def short_of(self, spot: OrbitPoint, zero: Zero, off: float) -> tuple[float, OrbitPoint]:
-        """The point so far before a zero on the way from another point; if there is none, the zero."""
+        """The point a given distance before a zero on the way from another point; or the zero."""
         s = zero.s - off
         here = None if s <= 0 else self.at(spot, s, spot.look.u + s / zero.s * (zero.spot.look.u - spot.look.u))
         return (zero.s, zero.spot) if here is None else (s, here)
@@ -306,7 +306,7 @@ class OrbitTracer:
         return found
 
     def locate(self, spot: OrbitPoint, step: OrbitPoint, length: float, test: Test, scale: float) -> Zero | None:
-        """By bracketing: the curve is smooth there, and so is the test function but for the least value of a guard."""
+        """By bracketing: the curve is smooth there, and so is the test function, except the least value of a guard."""
         seen: dict[float, OrbitPoint] = {0.0: spot, length: step}
         chord = step.look.u - spot.look.u
 

@@ -94,7 +94,7 @@ def slow(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> Sc
 class Completed(NamedTuple):
     """What an impact leads to: a flight, or with all the flights that would follow it a state of rest."""
 
-    rises: Bool[Array, ""]  # whether dh/dt > 0 after the impact, but for rounding
+    rises: Bool[Array, ""]  # whether dh/dt > 0 after the impact, by more than rounding
     flight: Scalar  # how long the next flight lasts
     rest: Scalar  # how long all flights together last
     y: Y  # the state after all of them

@@ -311,7 +311,7 @@ def _amend(here: Instant, trial: dict, seen: Outcome, noise: dict) -> tuple[dict
             over = jnp.abs(s[k]) / (model.bound(k) if k in model.holdable else 1) - 1
             against = -rates[k] * trial[k].astype(rates[k].dtype)
         excess.append(jnp.where(held, over, -1))
-        # What has just left has its λ at the bound (or it crosses): dh/dt may be zero but for rounding.
+        # What has just left has its λ at the bound (or it crosses): dh/dt may be zero apart from rounding.
         free = here.open(k) & ~held & (trial[k] != 0 if k not in model.contacts else True) & (here.leaves[k] == 0)
         opposed.append(jnp.where(free & (against > 1e-10 * jnp.abs(slopes[k])), against, 0))
     worst = jnp.stack(excess)

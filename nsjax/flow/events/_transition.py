@@ -27,7 +27,7 @@ class Transition(NamedTuple):
 
     found: Bool[Array, ""]
     t: Scalar  # of the event
-    t_after: Scalar  # the same, but for an accumulation of impacts that was completed: its time
+    t_after: Scalar  # the same; of an accumulation of impacts the time at which it ends
     y_before: Y
     y_after: Y
     f_after: Y
@@ -240,7 +240,7 @@ class _Event:
     def choose(self) -> tuple[ModeState, Bool[Array, ""]]:
         """The mode from here on, and whether another solution goes on in another one."""
         model, at = self.model, {k: self.at[k] for k in sorted(self.at)}
-        # What cannot be held crosses when it fires, but for the residual of an event a few ulps earlier, which dh/dt
+        # What cannot be held crosses when it fires, unless that is the residual of an event a few ulps earlier: dh/dt
         # tells.
         crosses = [now & ~(self.halted & (roots == 0)) for now, roots in zip(self.fired, self.state.roots)]
         leaves = {

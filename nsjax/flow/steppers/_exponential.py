@@ -24,7 +24,7 @@ from ...system._model import SwitchedSystem
 from ._stepper import bernstein, jittered, stack, Step, Stepper, unresolved, Watched, with_multipliers
 
 
-_N = 10  # a step is sampled at so many equal parts; the polynomial through them is its dense output
+_N = 10  # number of equal parts at which a step is sampled; the polynomial through them is its dense output
 _TERMS = 16  # of the series of the exponential, for arguments up to `_NEAR`
 _NEAR = 0.75
 
@@ -50,8 +50,8 @@ class Exponential(dfx.AbstractAdaptiveSolver):
     """A diffrax solver by the matrix exponential, for fields affine in the state, with forcing that is constant,
     linear or quadratic in time, harmonic (of one frequency) or exponential.
 
-    A step is exact but for rounding, whatever its length: also for defective and singular matrices, in resonance, for
-    sliding modes, and for stiff modes once they have decayed. Its length is only what a polynomial of degree 10 can
+    A step is exact apart from rounding, whatever its length: also for defective and singular matrices, in resonance,
+    for sliding modes, and for stiff modes once they have decayed. Its length is only what a polynomial of degree 10 can
     stand for, which is where events are looked for and what dense output is made of, to about 1e-11 of the state's
     size along the step (1e-5 in single precision). In `nsjax.solve` tolerances play no role; of a
     `diffrax.PIDController` only `dtmax` matters.
@@ -136,7 +136,7 @@ def generator(
         )
         eps = float(jnp.finfo(t.dtype).eps)
         fits = lax.stop_gradient(rest <= 1e7 * eps * rate * fast)
-        # On a surface that holds the solution forcing cancels but for rounding, which is of no kind.
+        # On a surface that holds the solution forcing cancels; the rounding that is left has no kind.
         moves = jnp.max(jnp.abs(b1)) * dt**2 + jnp.max(jnp.abs(b2)) * jnp.abs(dt) ** 3
         force = jnp.max(jnp.abs(f)) if force is None else force
         still = moves <= 1e5 * eps * (jnp.max(jnp.abs(x)) + force * jnp.abs(dt))

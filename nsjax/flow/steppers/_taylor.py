@@ -154,7 +154,7 @@ def _powers(x: Scalar, n: int) -> list[Scalar]:
 
 @ft.lru_cache
 def _from_powers(degree: int) -> np.ndarray:
-    """Matrix from power coefficients on [0, 1] to Bernstein coefficients, exact but for rounding."""
+    """Matrix from power coefficients on [0, 1] to Bernstein coefficients, exact apart from rounding."""
     return np.array([[math.comb(j, i) / math.comb(degree, i) for i in range(degree + 1)] for j in range(degree + 1)])
 
 

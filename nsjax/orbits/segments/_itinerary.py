@@ -78,7 +78,7 @@ class Start(NamedTuple):
 
 
 def capacity_for(segments: int) -> int:
-    """Rows for so many segments: few different numbers, as each is a program to be compiled."""
+    """Rows for a number of segments: few different capacities, because each is a program to compile."""
     return next(c for c in (4, 8, 16, 32, 64, 128, 256, 512) if c >= segments)
 
 

@@ -32,7 +32,7 @@ from ._lane import EACH, ENDED, follow_lane, Lane, lane_tests, LOST, NO_ORBIT
 @shown
 class OrbitBranches(eqx.Module):
     """Branches of periodic orbits over a parameter, a lane each, in rows of `points`; rows past the last of a lane are
-    not numbers.
+    NaN.
 
     **Attributes:**
 
@@ -47,7 +47,7 @@ class OrbitBranches(eqx.Module):
     - `start`: at which point each lane set out.
     - `num`: how many points each lane has.
     - `ends`: why each branch begins and ends where it does, shape `(lanes, 2)`, as text: the end of the interval; a
-        corner, which `continue_orbit` tells more about; "more than so many points" (or orbits computed, where steps
+        corner, which `continue_orbit` tells more about; "more than n points" (or orbits computed, where steps
         have to be short); "lost", where Newton's method failed; or "no orbit", where there was none to start from.
     """
 
@@ -128,7 +128,7 @@ def continue_orbits(
     - `orbits`: an `Orbit` whose leaves have a leading axis for lanes, as `jax.vmap` or `sweep` of `find_orbit` returns
         it; or a list of orbits. Their systems, `orbits.system`, may differ in other parameters.
     - `parameter`, `interval`: the name of the parameter that varies, and its interval.
-    - `points`: so many each way at most.
+    - `points`: the largest number of points each way.
     - `scale`: the typical size of each component of the state; by default what it has along the first orbit.
     - `max_step`, `solver`, `stepsize_controller`, `max_steps`: as for `continue_orbit`.
     - `chunk`: how many lanes go together, see `sweep`.

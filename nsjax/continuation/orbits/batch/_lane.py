@@ -103,7 +103,7 @@ def follow_lane(
     max_step: Array,
     points: int,
 ) -> Lane:
-    """The branch from `u` on, to its end, to the first corner, or to so many points."""
+    """The branch from `u` on, to its end, to the first corner, or to `points` points."""
     zero, none = jnp.zeros_like(u[0]), jnp.zeros((), jnp.int32)
     border = jnp.zeros_like(u).at[-1].set(1)
     blank = jax.eval_shape(

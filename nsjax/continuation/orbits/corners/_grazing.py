@@ -125,7 +125,7 @@ def cut_itinerary(
             order[i, j] = len(rows) - 1
             begin, x = t, look.spots[i, j]
         rows.append((c.mode[i], c.part[i], c.ends[i], c.slot[i], c.entry[i], begin, look.end[i], x))
-    if whole:  # its beginning is none of its events
+    if whole:  # it does not begin at one of its events
         last = rows.pop()
         period = float(look.period)
         first = rows[0]
