@@ -2,6 +2,7 @@
 
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar
@@ -69,3 +70,15 @@ def _determinant(columns: list[list[Array]]) -> Scalar:
         return first[0]
     minors = [_determinant([c[:i] + c[i + 1 :] for c in others]) for i in range(len(first))]
     return sum((x * m * (-1) ** i for i, (x, m) in enumerate(zip(first[1:], minors[1:]), 1)), first[0] * minors[0])
+
+
+def bialternate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The bialternate product A ⊙ B. Sums of two eigenvalues of A are the eigenvalues of 2 A ⊙ I, their products those
+    of A ⊙ A (half the Kronecker sum and product, without what is there twice); Guckenheimer, Myers & Sturmfels (1997).
+    """
+    i, j = np.triu_indices(len(a), 1)
+
+    def minors(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return a[np.ix_(i, i)] * b[np.ix_(j, j)] - a[np.ix_(i, j)] * b[np.ix_(j, i)]
+
+    return (minors(a, b) + minors(b, a)) / 2

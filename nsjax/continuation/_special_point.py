@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import equinox as eqx
 
-from ..setvalued._pencil import EigenvalueCrossing
+from ..setvalued._crossing import EigenvalueCrossing
 
 
 class AbstractHalfBranch(eqx.Module):

@@ -19,7 +19,9 @@ from ..orbits._orbit import ravel
 from ..sweeps._sweep import sweep
 from ..system._parameter import parameter_path, put_parameter
 from ..system._system import arrays_of, System
-from ._poincare import Iterate, phase_map, PoincareMap, positive, Section, section_map
+from ._iterate import Iterate, PoincareMap, positive
+from ._section import Section, section_map
+from ._stroboscopic import phase_map
 
 
 @shown

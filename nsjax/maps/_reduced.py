@@ -18,7 +18,8 @@ from ..flow._integrator import Integrator
 from ..flow._results import is_okay, outcomes, raise_if, RESULTS
 from ..flow._solve import integrate
 from ..system._system import arrays_of, System
-from ._poincare import phase_map, unless_failed
+from ._iterate import unless_failed
+from ._stroboscopic import phase_map
 
 
 @shown

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import ArrayLike, Complex, Float
 
 from .._numerics._text import between, shown
-from ._pencil import EigenvalueCrossing, Pencil
+from ._crossing import EigenvalueCrossing
+from ._pencil import Pencil
 
 
 @shown

@@ -1,58 +1,16 @@
 """Matrix pencils A + q B: every q at which an eigenvalue meets the imaginary axis, or the unit circle, by algebra."""
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from .._numerics._text import shown
+from ._crossing import EigenvalueCrossing
+from ._matrix_polynomial import balanced, DOUBT, GENERIC, pencils, polished, regular, singular_places
 
 
 BEYOND = 0.25  # roots this far outside [0, 1] are known too, so that an end point has a before and an after
 NEARLY_REAL = 1e-3  # a root of multiplicity m comes out as m complex ones, about eps^(1/m) apart
-DOUBT = 1e3 * float(np.finfo(np.float64).eps)  # relative to the entries of the matrix
-GENERIC = np.array([0.61803399, 0.14142136, -0.11803399, 0.90450850, 1.17320508, 0.38196601])
-
-
-@shown
-class EigenvalueCrossing(NamedTuple):
-    """A place at which an eigenvalue meets the imaginary axis, or a multiplier the unit circle.
-
-    - `q`: where: a number in [0, 1], or `(q1, q2)` where two surfaces meet.
-    - `eigenvalue`: exactly on the axis or circle. Of a complex pair, which counts as one crossing, that with the
-        positive imaginary part.
-    - `multiplicity`: algebraic, of this eigenvalue at `q`.
-    - `direction`: +1 if there are more unstable eigenvalues after `q` than before, -1 if fewer, 0 if as many: the path
-        touches the axis, or one crosses each way.
-    - `unstable`: how many eigenvalues (both of a pair) lie right of the axis, or outside the circle, before and after.
-    - `until`: `q` itself; or, for an eigenvalue that stays on the axis (a free motion, an undamped oscillation, the
-        trivial multiplier 1), where that ends. Then `eigenvalue` is one on the way, and `direction` and `unstable` tell
-        what happens where it arrives on the axis and where it leaves.
-    """
-
-    q: Any
-    eigenvalue: complex
-    multiplicity: int
-    direction: int
-    unstable: tuple[int, int]
-    until: Any
-
-    @property
-    def kind(self) -> str:
-        """ "zero" or "pair", of multipliers "+1", "-1" or "pair"."""
-        names: dict[complex, str] = {0j: "zero", 1 + 0j: "+1", -1 + 0j: "-1"}
-        return names.get(self.eigenvalue, "pair")
-
-    def __str__(self) -> str:
-        def place(q: Any) -> str:
-            return f"({q[0]:.10g}, {q[1]:.10g})" if isinstance(q, tuple) else f"{q:.10g}"
-
-        where = place(self.q) + (f" to {place(self.until)}" if self.until != self.q else "")
-        z, pair = self.eigenvalue, self.kind == "pair"
-        value = f"{'' if z.real == 0 else f'{z.real:.10g} '}±{'' if z.real == 0 else ' '}{z.imag:.10g}i"
-        times = f" ({self.multiplicity} times)" if self.multiplicity > 1 else ""
-        value = value if pair else f"{z.real:.10g}"
-        return f"q = {where}: eigenvalue {value}{times}, unstable {self.unstable[0]} -> {self.unstable[1]}"
 
 
 class _Spectrum(NamedTuple):
@@ -92,117 +50,6 @@ def _spectrum(a: np.ndarray, b: np.ndarray, q: float, circle: bool) -> _Spectrum
         return _Spectrum(values, side, slope, bend, doubt, first)
 
 
-def bialternate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The bialternate product A ⊙ B. Sums of two eigenvalues of A are the eigenvalues of 2 A ⊙ I, their products those
-    of A ⊙ A (half the Kronecker sum and product, without what is there twice); Guckenheimer, Myers & Sturmfels (1997).
-    """
-    i, j = np.triu_indices(len(a), 1)
-
-    def minors(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return a[np.ix_(i, i)] * b[np.ix_(j, j)] - a[np.ix_(i, j)] * b[np.ix_(j, i)]
-
-    return (minors(a, b) + minors(b, a)) / 2
-
-
-def _pencils(a: np.ndarray, b: np.ndarray, circle: bool) -> list[tuple[complex | None, list[np.ndarray]]]:
-    """Polynomials in q, as lists of their coefficients, which are singular where an eigenvalue is at the point named
-    first, or (at None) where a pair may be on the axis or circle."""
-    eye = np.eye(len(a))
-    if not circle:
-        return [(0j, [a, b]), (None, [2 * bialternate(a, eye), 2 * bialternate(b, eye)])]
-    products = [bialternate(a, a) - np.eye(len(a) * (len(a) - 1) // 2), 2 * bialternate(a, b), bialternate(b, b)]
-    return [(1 + 0j, [a - eye, b]), (-1 + 0j, [a + eye, b]), (None, products)]
-
-
-def _balanced(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both in units (powers of two, for no rounding) in which rows are as large as columns; Osborne's iteration."""
-    a, b = a.copy(), b.copy()
-    for _ in range(20):
-        still = True
-        for i in range(len(a)):
-            size = np.abs(a) + np.abs(b)
-            row, column = size[i].sum() - size[i, i], size[:, i].sum() - size[i, i]
-            power = np.round(0.5 * np.log2(row / column)) if row > 0 and column > 0 else 0.0
-            if power:
-                still = False
-                for matrix in (a, b):
-                    matrix[i] *= 2.0**-power
-                    matrix[:, i] *= 2.0**power
-        if still:
-            break
-    return a, b
-
-
-def _polynomial(coefficients: list[np.ndarray], q: float) -> np.ndarray:
-    return sum((c * q**k for k, c in enumerate(coefficients)), np.zeros_like(coefficients[0]))
-
-
-def _scaled(coefficients: list[np.ndarray]) -> list[np.ndarray]:
-    """The same with rows and columns of one size, which leaves its roots where they are."""
-    for _ in range(3):
-        for axis in (0, 1):
-            size = np.abs(coefficients).sum(axis=0).max(axis=axis, keepdims=True)
-            size = 2.0 ** -np.round(np.log2(np.where(size > 0, size, 1)))
-            coefficients = [c * size for c in coefficients]
-    return coefficients
-
-
-def _regular(coefficients: list[np.ndarray]) -> tuple[list[np.ndarray], bool]:
-    """A polynomial that is not singular for every q, and whether it was.
-
-    Where it was, it loses rank at the roots that are left, and so does its projection to random subspaces, whose other
-    roots mean nothing; Hochstenbach, Mehl & Plestenjak (2023).
-    """
-    coefficients = _scaled(coefficients)
-    n = len(coefficients[0])
-    rank = 0
-    for q in GENERIC:
-        sizes = np.linalg.svd(_polynomial(coefficients, q), compute_uv=False)
-        rank = max(rank, int(np.sum(sizes > DOUBT * sizes[0])))
-        if rank == n:
-            return coefficients, False
-    rng = np.random.default_rng(0)
-    u, v = (np.linalg.qr(rng.standard_normal((n, n)))[0][:, :rank] for _ in "uv")
-    return [u.T @ c @ v for c in coefficients], True
-
-
-def _roots(coefficients: list[np.ndarray]) -> np.ndarray:
-    """Every q, complex too, at which the polynomial is singular: a generalized eigenvalue problem, of the companion
-    form if it is quadratic, shifted to where it is best conditioned."""
-    n = len(coefficients[0])
-    if n == 0:
-        return np.zeros(0, complex)
-    if len(coefficients) == 2:
-        constant, linear = coefficients
-    else:
-        zero, eye = np.zeros((n, n)), np.eye(n)
-        constant = np.block([[coefficients[0], coefficients[1]], [zero, -eye]])
-        linear = np.block([[zero, coefficients[2]], [eye, zero]])
-    with np.errstate(all="ignore"):
-        shift = min(GENERIC[:3], key=lambda q: np.nan_to_num(np.linalg.cond(constant + q * linear), nan=np.inf))
-        try:
-            return shift - 1 / np.linalg.eigvals(np.linalg.solve(constant + shift * linear, linear)).astype(complex)
-        except np.linalg.LinAlgError:
-            return np.zeros(0, complex)
-
-
-def _polished(coefficients: list[np.ndarray], start: float, reach: float) -> float:
-    """Newton's method on the determinant, from a root that is known to some digits: q - 1 / tr(P⁻¹ P')."""
-    slope = [k * c for k, c in enumerate(coefficients)][1:]
-    q = start
-    for _ in range(6):
-        try:
-            trace = np.trace(np.linalg.solve(_polynomial(coefficients, q), _polynomial(slope, q)))
-        except np.linalg.LinAlgError:  # a root to the last digit
-            return q
-        if not np.isfinite(trace) or trace == 0 or abs(q - 1 / trace - start) > reach:
-            return start
-        q -= 1 / trace
-        if abs(trace) > 1e16:
-            break
-    return float(q)
-
-
 class _Candidate(NamedTuple):
     q: float
     root: float  # as the eigenvalue problem gave it
@@ -214,7 +61,7 @@ class Pencil:
     """A + q B, and its crossings for q in [0, 1]."""
 
     def __init__(self, a: np.ndarray, b: np.ndarray, circle: bool):
-        self.a, self.b = _balanced(a, b)
+        self.a, self.b = balanced(a, b)
         self.circle, self.stays = circle, False
         self.known: dict[float, _Spectrum] = {}
 
@@ -242,12 +89,12 @@ class Pencil:
 
     def candidates(self) -> list[_Candidate]:
         found = []
-        for point, polynomial in _pencils(self.a, self.b, self.circle):
+        for point, polynomial in pencils(self.a, self.b, self.circle):
             if not len(polynomial[0]):
                 continue
-            polynomial, singular = _regular(polynomial)
+            polynomial, singular = regular(polynomial)
             self.stays |= singular
-            roots = _roots(polynomial)
+            roots = singular_places(polynomial)
             if singular and point is None:
                 roots = np.append(roots, self._collisions())
             with np.errstate(invalid="ignore"):
@@ -256,7 +103,7 @@ class Pencil:
                 real = root.imag == 0
                 others = np.abs(root - roots[roots != root])
                 reach = min(NEARLY_REAL, 0.3 * others.min(initial=1.0))  # not to another root
-                q = _polished(polynomial, root.real, reach) if real else float(root.real)
+                q = polished(polynomial, root.real, reach) if real else float(root.real)
                 found.append(_Candidate(q, float(root.real), point, 1 if real else 2))
         return sorted(found, key=lambda c: c.q)
 

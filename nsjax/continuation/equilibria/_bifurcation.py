@@ -9,7 +9,7 @@ import numpy as np
 
 from ..._numerics._text import listed, shown
 from ..._types import Y
-from ...setvalued._pencil import EigenvalueCrossing
+from ...setvalued._crossing import EigenvalueCrossing
 from .._special_point import AbstractHalfBranch, AbstractSpecialPoint
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from ..._numerics._text import shown
 from ..._types import Y
-from ...setvalued._pencil import EigenvalueCrossing
+from ...setvalued._crossing import EigenvalueCrossing
 from ...system._system import System
 from .._archive import table
 from .._branch import AbstractBranch

@@ -7,8 +7,8 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 
+from ...setvalued._crossing import EigenvalueCrossing
 from ...setvalued._eigenvalue_crossings import eigenvalue_crossings
-from ...setvalued._pencil import EigenvalueCrossing
 from ._bifurcation import Bifurcation, classify, HalfBranch, kind_by_count, odd_one, unstable_number
 from ._corrector import branching, kept, linearised, near, row_sizes, Step, step_along
 from ._equations import EquilibriumCurve, first_lyapunov_coefficient

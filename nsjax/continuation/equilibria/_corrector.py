@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from ..._numerics._linalg import bialternate
 from ..._numerics._root import find_root, Newton
-from ...setvalued._pencil import bialternate
 
 
 # Test functions, before those of the guards. A curve leaves its interval at LOW and HIGH, and passes the parameter's

@@ -11,7 +11,7 @@ from ..._numerics._text import listed, shown
 from ..._types import Y
 from ...maps._corner_normal_form import CornerKind
 from ...orbits.segments._equations import OrbitCurve
-from ...setvalued._pencil import EigenvalueCrossing
+from ...setvalued._crossing import EigenvalueCrossing
 from .._special_point import AbstractHalfBranch, AbstractSpecialPoint
 from ._test_functions import Test
 from ._tracer import OrbitPoint

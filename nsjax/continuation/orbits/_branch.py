@@ -16,7 +16,7 @@ from ...orbits._orbit import Orbit
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._guess import Segment
 from ...orbits.segments._itinerary import GRAZING, REPELLING_EXIT, TIME
-from ...setvalued._pencil import EigenvalueCrossing
+from ...setvalued._crossing import EigenvalueCrossing
 from ...system._parameter import parameter_path, put_parameter
 from ...system._system import System
 from .._archive import table

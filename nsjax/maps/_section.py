@@ -1,69 +1,35 @@
-"""Poincaré maps: from one crossing of a section to the next, (6.4), and over a period of the forcing, (6.10).
+"""The Poincaré map (6.4): from one crossing of a section to the next."""
 
-A section is watched like a switch on which nothing depends, and the solution ends at its event: there the field jumps
-from f to 0, so that the saltation matrix (3.30) is I - f nᵀ / (nᵀ f), and the derivative of the map is (6.7).
-"""
-
-import abc
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
-import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from .._numerics._autodiff import frozen
-from .._numerics._text import between, listed, shown, written
 from .._types import Scalar, Y
-from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
-from ..flow._results import is_okay, outcomes, raise_if, RESULTS
+from ..flow._results import is_okay, RESULTS
 from ..flow._solve import integrate
-from ..flow.events._initial_mode import AT_ONCE, start_mode
-from ..system._checks import check_model, check_system
+from ..flow.events._initial_mode import AT_ONCE
 from ..system._clock import clock
 from ..system._impact import impact
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
 from ..system._sgn import sgn
 from ..system._switch import AbstractSwitch, forwarded
-from ..system._system import arrays_of, SwitchValues, System
+from ..system._system import SwitchValues, System
+from ._iterate import Iterate, iterated, PoincareMap, positive
 
 
 PERIODS = 100  # of the forcing in which a solution is expected to return
 
 Section = Callable[[Scalar, Y], Scalar] | str
-
-
-@shown
-class Iterate(NamedTuple):
-    """An iterate of a Poincaré map; several have a leading axis.
-
-    **Attributes:**
-
-    - `t`: its time [time].
-    - `y`: the state there; NaN where there is none.
-    - `mode`: one value for each switch, as `mode=` of `poincare_map` and `solve` takes it.
-    - `result`: `RESULTS`.
-    """
-
-    t: Scalar
-    y: Y
-    mode: Int[Array, " switches"]
-    result: RESULTS
-
-    def __str__(self) -> str:
-        axes = jnp.ndim(self.t)
-        if axes:
-            head = f"{self.t.size} iterates from t = {between(self.t)}"
-            return f"{head}\n  states  {written(self.y, axes)}\n  result  {outcomes(self.result)}"
-        mode = f"; mode ({listed(self.mode)})" if len(self.mode) else ""
-        return f"iterate at t = {float(self.t):.10g}: {written(self.y)}{mode}; {outcomes(self.result)}"
 
 
 def _section_name(system: System) -> str:
@@ -108,82 +74,6 @@ class _Watched(System):
     @property
     def period(self) -> Float[Array, ""] | float | None:
         return self.system.period
-
-
-class Start(NamedTuple):
-    """Where iterates begin."""
-
-    t0: Scalar  # of the solution
-    t: Scalar
-    y: Y
-    mode: Int[Array, " switches"]
-    result: RESULTS
-    named: tuple[bool, ...]  # which switches `mode=` of `solve` may name
-
-
-class PoincareMap(eqx.Module):
-    """A Poincaré map, applied over and over."""
-
-    integrator: Integrator
-
-    @abc.abstractmethod
-    def flow_of(self, system: System) -> System:
-        """The system to be solved."""
-
-    @abc.abstractmethod
-    def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
-        """The next iterate after the one at (t, y), of a solution that began at t0."""
-
-    @abc.abstractmethod
-    def horizon(self, system: System, t: Scalar) -> Scalar:
-        """How long one application may take."""
-
-    def start(self, system: System, t: Scalar, y: Y, given: dict[str, Any]) -> Start:
-        """What `iterates` begins with."""
-        one = jnp.ones_like(t)
-        t = check_model(system, t, y, one)
-        system = self.flow_of(system)
-        still, t_still, y_still = frozen((system, t, y))
-        model = SwitchedSystem(still, one, t_still, y_still)
-        # An impact that cannot be rested upon has one mode only, of which `solve` wants to hear nothing.
-        named = tuple(k in model.contacts or not isinstance(s, impact) for k, s in enumerate(model.switches))
-        given = {s.name: given[s.name] for s, may in zip(model.switches, named) if may and s.name in given}
-        state, _, result = start_mode(model, t_still, y_still, given, self.horizon(still, t))
-        modes = [m.astype(jnp.int32) for m in self.sides(model, t_still, y_still, state)]
-        return Start(t, t, y, jnp.stack(modes) if modes else jnp.zeros(0, jnp.int32), result, named)
-
-    def sides(self, model: SwitchedSystem, t: Scalar, y: Y, state: ModeState) -> tuple[Array, ...]:
-        """The mode in which a solution sets out."""
-        return state.mode
-
-    def iterates(self, system: System, start: Start, number: int, each: int = 1) -> Iterate:
-        """So many iterates, of the `each`-th power of the map, from what `start` returned."""
-        begin, step = self._stepping(system, start)
-        _, rows = lax.scan(lambda here, _: (step(here),) * 2, begin, None, length=number * each)
-        t, y, mode, result = jax.tree.map(lambda x: x[each - 1 :: each], rows)
-        t = jax.vmap(unless_failed)(result, t)
-        return Iterate(t, y, mode[:, : len(system.switches)], result)
-
-    def skip(self, system: System, start: Start, number: int) -> Start:
-        """So many iterates later."""
-        begin, step = self._stepping(system, start)
-        now = lax.fori_loop(0, number, lambda _, here: step(here), begin)
-        t, y, mode, result = now
-        return Start(start.t0, t, y, mode, result, start.named)
-
-    def _stepping(self, system: System, start: Start) -> tuple[tuple, Callable[[tuple], tuple]]:
-        system = self.flow_of(system)
-        names = [k.name for k in system.switches]
-
-        def step(here: tuple) -> tuple:
-            t, y, mode, result = here
-            given = {name: mode[k] for k, name in enumerate(names) if start.named[k]}
-            later, y, mode, now = self.once(system, t, start.t0, y, given)
-            # What has failed stays failed; it goes on from NaN, which takes no step.
-            result = RESULTS.where(is_okay(result) & (now != RESULTS.successful), now, result)
-            return jnp.where(is_okay(result), later, t), unless_failed(result, y), mode, result
-
-        return (start.t, start.y, start.mode, start.result), step
 
 
 class _Section(PoincareMap):
@@ -236,34 +126,6 @@ def _onto(switch: AbstractSwitch, system: System, t: Scalar, y: Y) -> Y:
     return unravel(flat - h * normal / jnp.where(normal @ normal == 0, 1, normal @ normal))
 
 
-class _Phase(PoincareMap):
-    """From one phase of the forcing to the next."""
-
-    order: int = eqx.field(static=True)
-
-    def flow_of(self, system: System) -> System:
-        return system
-
-    def horizon(self, system: System, t: Scalar) -> Scalar:
-        return jnp.asarray(system.period, t.dtype) * self.order
-
-    def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
-        # Each time from t0, so that time does not lose digits.
-        period = self.horizon(system, t)
-        sol = integrate(system, t0, t0 + period, y, self.integrator, mode=mode or None)
-        return t + period, sol.y1, sol.mode1, sol.result
-
-
-def unless_failed(result: RESULTS, tree: Any) -> Any:
-    """`tree`, or NaN, derivatives included."""
-    return jax.tree.map(lambda x: x * jnp.where(is_okay(result), 1, jnp.nan).astype(x.dtype), tree)
-
-
-def positive(name: str, value: Any) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise ValueError(f"Argument `{name}` must be a positive integer, but got {value!r}.")
-
-
 def section_map(
     system: System, section: Section, direction: int, max_time: Any, t: Scalar, y: Y, integrator: Integrator
 ) -> PoincareMap:
@@ -312,46 +174,6 @@ def section_map(
     # A plain function is no array, nor has it any: it belongs to the structure.
     plain = jax.tree.leaves(section) == [section]
     return _Section(integrator, jax.tree_util.Partial(section) if plain else section, None, direction, time)
-
-
-def phase_map(system: System, order: int, integrator: Integrator) -> PoincareMap:
-    """The map over periods of the forcing."""
-    check_system(system)
-    positive("order", order)
-    if system.period is None:
-        raise ValueError(
-            f"Argument `system` must be forced for a map over its period, but `{type(system).__name__}.period` is "
-            "None. For an autonomous system take `nsjax.poincare_map` with a section."
-        )
-    return _Phase(integrator, order)
-
-
-@eqx.filter_jit
-def _apply(
-    step: PoincareMap, system: System, t0: Scalar, y0: Y, given: dict[str, Any], number: int | None, each: int
-) -> Iterate:
-    rows = step.iterates(system, step.start(system, t0, y0, given), number or 1, each)
-    return jax.tree.map(lambda x: x[0], rows) if number is None else rows
-
-
-def _iterated(
-    make: Callable[[System, Scalar, Y], PoincareMap],
-    system: System,
-    start: tuple[Any, Y, Any],
-    iterates: int | None,
-    each: int,
-    throw: bool,
-) -> Iterate:
-    """Checks what the two maps have in common, and applies them from a `start`: time, state, mode."""
-    if iterates is not None:
-        positive("iterates", iterates)
-    t0, y0, given = checked_start(system, *start)
-    system = arrays_of(system, t0.dtype)
-    out = _apply(make(system, t0, y0), system, t0, y0, given, iterates, each)
-    if throw:
-        last = jax.tree.map(lambda x: x if iterates is None else x[-1], out.result)
-        out = raise_if(~is_okay(last), last, out)
-    return out
 
 
 def poincare_map(
@@ -416,45 +238,4 @@ def poincare_map(
     def make(system: System, t: Scalar, y: Y) -> PoincareMap:
         return section_map(system, section, direction, max_time, t, y, integrator.checked(t.dtype))
 
-    return _iterated(make, system, (t0, y0, mode), iterates, number, throw)
-
-
-def stroboscopic_map(
-    system: System,
-    y0: Y,
-    *,
-    order: int = 1,
-    iterates: int | None = None,
-    t0: Any = 0.0,
-    mode: Any = None,
-    solver: dfx.AbstractSolver = dfx.Tsit5(),
-    stepsize_controller: dfx.AbstractStepSizeController | None = None,
-    max_steps: int = 4096,
-    max_events: int = 256,
-    adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
-    throw: bool = True,
-) -> Iterate:
-    """The T-advance map (6.10) of a forced system: the state `order` periods of the forcing later.
-
-    Its derivative by `jax.jacfwd` is the fundamental solution matrix.
-
-    **Arguments:**
-
-    - `system`: the model, whose `period` is not None.
-    - `y0`: the state at `t0`.
-    - `order`: over how many periods of the forcing.
-    - `iterates`: how many iterates, which then have a leading axis; by default one, without.
-    - `t0`: the phase of the forcing [time].
-    - `mode`, `solver`, `stepsize_controller`, `adjoint`: as for `solve`. `max_steps`, `max_events`: for each iterate.
-    - `throw`: whether a failure raises; if not, look at `Iterate.result`.
-
-    **Returns:** an `Iterate`.
-
-    **Raises:** `ValueError` for an autonomous system; a runtime error where `solve` fails.
-    """
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint)
-
-    def make(system: System, t: Scalar, y: Y) -> PoincareMap:
-        return phase_map(system, order, integrator.checked(t.dtype))
-
-    return _iterated(make, system, (t0, y0, mode), iterates, 1, throw)
+    return iterated(make, system, (t0, y0, mode), iterates, number, throw)

@@ -1,0 +1,87 @@
+"""The T-advance map (6.10) of a forced system: from one phase of the forcing to the same of a later period."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._types import Scalar, Y
+from ..flow._integrator import Integrator
+from ..flow._results import RESULTS
+from ..flow._solve import integrate
+from ..system._checks import check_system
+from ..system._system import System
+from ._iterate import Iterate, iterated, PoincareMap, positive
+
+
+class _Phase(PoincareMap):
+    """From one phase of the forcing to the next."""
+
+    order: int = eqx.field(static=True)
+
+    def flow_of(self, system: System) -> System:
+        return system
+
+    def horizon(self, system: System, t: Scalar) -> Scalar:
+        return jnp.asarray(system.period, t.dtype) * self.order
+
+    def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
+        # Each time from t0, so that time does not lose digits.
+        period = self.horizon(system, t)
+        sol = integrate(system, t0, t0 + period, y, self.integrator, mode=mode or None)
+        return t + period, sol.y1, sol.mode1, sol.result
+
+
+def phase_map(system: System, order: int, integrator: Integrator) -> PoincareMap:
+    """The map over periods of the forcing."""
+    check_system(system)
+    positive("order", order)
+    if system.period is None:
+        raise ValueError(
+            f"Argument `system` must be forced for a map over its period, but `{type(system).__name__}.period` is "
+            "None. For an autonomous system take `nsjax.poincare_map` with a section."
+        )
+    return _Phase(integrator, order)
+
+
+def stroboscopic_map(
+    system: System,
+    y0: Y,
+    *,
+    order: int = 1,
+    iterates: int | None = None,
+    t0: Any = 0.0,
+    mode: Any = None,
+    solver: dfx.AbstractSolver = dfx.Tsit5(),
+    stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    max_steps: int = 4096,
+    max_events: int = 256,
+    adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
+    throw: bool = True,
+) -> Iterate:
+    """The T-advance map (6.10) of a forced system: the state `order` periods of the forcing later.
+
+    Its derivative by `jax.jacfwd` is the fundamental solution matrix.
+
+    **Arguments:**
+
+    - `system`: the model, whose `period` is not None.
+    - `y0`: the state at `t0`.
+    - `order`: over how many periods of the forcing.
+    - `iterates`: how many iterates, which then have a leading axis; by default one, without.
+    - `t0`: the phase of the forcing [time].
+    - `mode`, `solver`, `stepsize_controller`, `adjoint`: as for `solve`. `max_steps`, `max_events`: for each iterate.
+    - `throw`: whether a failure raises; if not, look at `Iterate.result`.
+
+    **Returns:** an `Iterate`.
+
+    **Raises:** `ValueError` for an autonomous system; a runtime error where `solve` fails.
+    """
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint)
+
+    def make(system: System, t: Scalar, y: Y) -> PoincareMap:
+        return phase_map(system, order, integrator.checked(t.dtype))
+
+    return iterated(make, system, (t0, y0, mode), iterates, 1, throw)
