@@ -446,6 +446,16 @@ def test_brute_force_finds_the_steady_state():
     assert len(traced) == once
 
 
+def test_what_has_not_settled_gets_no_period():
+    """Pitfall 46: after a fixed time, 40 periods, a motion that decays by 6 % a period is on its way still. It is not
+    taken for the attractor that is near, but left undecided."""
+    lightly_damped = Oscillator(zeta=0.013, f=1.0, forced=True)
+    starts = Motion(jnp.asarray([5.0]), jnp.asarray([0.0]))
+    for transient, period in ((40, 0), (400, 1)):
+        found = brute_force(lightly_damped, "omega", jnp.asarray([1.3]), starts, transient=transient, keep=8)
+        assert found.periods().tolist() == [[period]]
+
+
 @pytest.fixture(scope="module")
 def belt_diagram():
     return brute_force(BELT, "omega", jnp.asarray([1.65, 1.68, 1.69, 1.8]), Motion(1.0, 0.0), transient=300, keep=40)

@@ -1,0 +1,67 @@
+"""What the README and the docstrings say of a model works as it is printed there (issue 20.18)."""
+
+import pathlib
+import re
+import textwrap
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+
+import nsjax
+
+
+README = (pathlib.Path(__file__).parents[2] / "README.md").read_text()
+
+
+class Line(NamedTuple):
+    x: Array | float
+
+
+class Driven(nsjax.System):
+    omega: float = 2.0
+
+    def vector_field(self, t, y, s):
+        return Line(-y.x + jnp.cos(self.omega * t))
+
+
+def test_a_forced_model_says_its_period_as_in_the_readme():
+    """Without it the error says what to write; with the lines of the README the orbit is found, in closed form
+    x(0) = 1/(1 + ω²)."""
+    with pytest.raises(ValueError, match=r"has no `period`.*return 2 \* jnp.pi / self.omega"):
+        nsjax.find_orbit(Driven(), Line(0.0), period=3.0)
+    (block,) = [text for text in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if "def period(self)" in text]
+    namespace = {"jnp": jnp}
+    exec(textwrap.dedent(block), namespace)
+    forced = type("Forced", (Driven,), {"period": namespace["period"]})
+    orbit = nsjax.find_orbit(forced(), Line(0.0))
+    np.testing.assert_allclose(orbit.y0.x, 1 / 5, atol=1e-10)
+    assert "period" in nsjax.System.__doc__
+
+
+def test_the_surfaces_of_a_relay_are_levels():
+    """A relay that starts on where it should be off switches off at once, as its docstring says."""
+
+    class Heater(nsjax.System):
+        def vector_field(self, t, y, s):
+            return Line(-y.x + 2 * s.heater)
+
+        @nsjax.relay
+        def heater(self, t, y):
+            return 0.5 - y.x
+
+        @heater.off
+        def heater(self, t, y):
+            return y.x - 1.0
+
+    assert "levels and not edges" in nsjax.relay.__doc__
+    sol = nsjax.solve(Heater(), 0.0, 0.5, Line(1.2), mode={"heater": 1})
+    np.testing.assert_allclose(sol.y1.x, 1.2 * np.exp(-0.5), rtol=1e-7)
+    assert not sol.mode1.any()
+
+
+def test_what_cannot_be_vmapped_is_named():
+    text = " ".join(README.split())
+    assert "can be vmapped, except what runs in Python" in text
