@@ -22,7 +22,7 @@ class AbstractHalfBranch(eqx.Module):
 class AbstractSpecialPoint(eqx.Module):
     """A bifurcation, or a place that only looks like one; see `Bifurcation` and `OrbitBifurcation`."""
 
-    plain: ClassVar[dict[str, str]]  # kinds that are no bifurcations, and how they are named
+    plain: ClassVar[dict[str, str]]  # kinds that have a name of their own
 
     kind: eqx.AbstractVar[str]
     discontinuous: eqx.AbstractVar[bool]
@@ -32,8 +32,9 @@ class AbstractSpecialPoint(eqx.Module):
 
     @property
     def is_bifurcation(self) -> bool:
-        """Whether it is one: not where the branch crosses a surface and nothing else happens, nor where it ends."""
-        return self.kind != "none" and self.kind not in self.plain
+        """Whether it is one: not where the branch crosses a surface and nothing else happens, where it is vertical
+        without turning back, or where it ends."""
+        return self.kind not in ("none", "hysteresis point", "end")
 
     @property
     def name(self) -> str:

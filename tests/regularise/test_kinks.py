@@ -347,7 +347,7 @@ MISTAKES = [
         Written(lambda x: jnp.exp(-jnp.abs(x))),
         np.ones(5),
         ValueError,
-        "affine in its kinks, but for 4, .* abs_1_0, abs_1_1",
+        "affine in all but 4 of its kinks, .* abs_1_0, abs_1_1",
     ),
     (Valve(), Heat(1.0), ValueError, "`Valve.vector_field` has a kink that depends on `s.heater`"),
     (Support, Motion(1.0, 0.0), TypeError, "Argument `system` must be an instance.*Call it"),
