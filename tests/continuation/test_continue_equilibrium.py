@@ -1,5 +1,7 @@
 """Equilibria continued over a parameter: every system of chapter 5 by the same call, and corners of other kinds."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -636,7 +638,7 @@ def test_orbits_born_at_a_hopf_point():
     with pytest.raises(ValueError, match="`distance` must be positive"):
         nsjax.hopf_orbits(system, b, -0.1)
     with pytest.raises(ValueError, match="must be a Hopf bifurcation, but is: saddle-node"):
-        nsjax.hopf_orbits(system, b._replace(kind="saddle-node", period=None, criticality=None), 0.1)
+        nsjax.hopf_orbits(system, dataclasses.replace(b, kind="saddle-node", period=None, criticality=None), 0.1)
 
 
 def test_orbits_born_subcritically():
