@@ -21,6 +21,7 @@ from ._cli import (
     first_line,
     is_ours,
     Job,
+    keep_programs,
     load,
     mistake,
     model_file,
@@ -292,6 +293,8 @@ def main(argv: list[str] | None = None) -> int:
     **Returns:** the exit status: 0, 1 for a numerical failure, 2 for a word that means nothing or a mistake in a model.
     """
     jax.config.update("jax_enable_x64", True)
+    if argv is None:
+        keep_programs()
     try:
         args = parse(sys.argv[1:] if argv is None else argv)
     except UsageError as error:

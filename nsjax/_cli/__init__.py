@@ -9,6 +9,7 @@ from ._branches import (
     DIAGRAMS as DIAGRAMS,
     draw_branches as draw_branches,
 )
+from ._cache import keep_programs as keep_programs
 from ._job import (
     Job as Job,
     load as load,

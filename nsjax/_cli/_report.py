@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._numerics._compile import interactive
 from .._types import Y
 from .._version import __version__
 from ..derivatives._saltation import saltation_matrices
@@ -190,7 +191,7 @@ def by_name(y: Y) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator=".") or "y": leaf for path, leaf in leaves}
 
 
-@eqx.filter_jit
+@interactive
 def _linearised(system: System, events: Events) -> Array:
     return saltation_matrices(system, events)
 

@@ -3,13 +3,13 @@
 from typing import Any, Literal
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._numerics._compile import interactive
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start, checked_time
 from ..flow._integrator import Integrator
@@ -113,7 +113,7 @@ def monodromy_by_arcs(system: System, sol: Solution, t0: Scalar, y0: Y, integrat
     return _by_arcs(system, sol, t0, y0, sol.t1[None], integrator)[0]
 
 
-@eqx.filter_jit
+@interactive
 def _by_arcs(
     system: System,
     sol: Solution,

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._numerics._autodiff import frozen
+from .._numerics._compile import interactive
 from .._numerics._root import find_root, Newton
 from .._numerics._text import listed, shown
 from .._types import Scalar, StateT, Y
@@ -112,7 +113,7 @@ def balance(model: SwitchedSystem, t: Scalar, y: Y, sigma: Array, state: ModeSta
     return jnp.concatenate([field, jnp.stack(rows)]) if rows else field
 
 
-@eqx.filter_jit
+@interactive
 def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, newton: Newton) -> Equilibrium:
     """Newton's method on f(y, s) = 0 in a given mode, with the values of the surfaces that hold the state as unknowns
     beside it, and h = 0 there as their equations."""

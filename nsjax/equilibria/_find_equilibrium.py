@@ -9,6 +9,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+from .._numerics._compile import interactive
 from .._numerics._jaxpr import is_constant
 from .._numerics._root import Newton
 from .._types import StateT, Y
@@ -169,6 +170,6 @@ def _in_all_modes(
     return [eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static) for i in good]
 
 
-@eqx.filter_jit
+@interactive
 def _batch(system: System, t: Any, starts: Y, modes: tuple, newton: Newton) -> Equilibrium:
     return jax.vmap(lambda y, mode: equilibrium_in(system, t, y, mode, newton))(starts, modes)

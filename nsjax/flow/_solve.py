@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from .._numerics._autodiff import dense_jacobian, forward_only, frozen
+from .._numerics._compile import interactive
 from .._numerics._jaxpr import is_affine, may_jump
 from .._numerics._text import known, suggesting
 from .._types import Scalar, StateT, Y
@@ -45,7 +46,7 @@ class _Options(NamedTuple):
     meter: dfx.AbstractProgressMeter = dfx.NoProgressMeter()
 
 
-@eqx.filter_jit
+@interactive
 def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> Solution:
     def run(system: System, t0: Scalar, t1: Scalar, y0: Y) -> Solution:
         return _integrate(system, t0, t1, y0, options)

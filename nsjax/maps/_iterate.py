@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .._numerics._autodiff import frozen
+from .._numerics._compile import interactive
 from .._numerics._text import between, listed, shown, written
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start
@@ -126,7 +127,7 @@ class PoincareMap(eqx.Module):
         return (start.t, start.y, start.mode, start.result), step
 
 
-@eqx.filter_jit
+@interactive
 def _apply(
     step: PoincareMap, system: System, t0: Scalar, y0: Y, given: dict[str, Any], number: int | None, each: int
 ) -> Iterate:

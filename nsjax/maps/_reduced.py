@@ -3,13 +3,13 @@
 from typing import Any, NamedTuple
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._numerics._compile import interactive
 from .._numerics._root import find_root, Newton
 from .._numerics._text import between, shown, written
 from .._types import Scalar, Y
@@ -131,7 +131,7 @@ class _Span(NamedTuple):
     integrator: Integrator
 
 
-@eqx.filter_jit
+@interactive
 def _reduced(
     parameters: tuple[System, Scalar, Scalar], guess: Y, place: int, span: _Span, newton: Newton
 ) -> ReducedIterate:

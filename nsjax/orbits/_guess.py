@@ -3,7 +3,6 @@
 from typing import Any
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._numerics._compile import interactive
 from .._types import Scalar, Y
 from ..derivatives._variational import arcs
 from ..flow._integrator import Integrator
@@ -63,7 +63,7 @@ def of_relays(system: System, mode: Any) -> Relays:
     return {k.name: mode[i] for i, k in enumerate(system.switches) if isinstance(k, relay)} or None
 
 
-@eqx.filter_jit
+@interactive
 def undecided(system: System, t0: Scalar, y0: Y) -> dict[str, Bool[Array, ""]]:
     """Which relays are within their hysteresis."""
     relays = [k for k in system.switches if isinstance(k, relay)]
@@ -90,7 +90,7 @@ def at_start(model: SwitchedSystem, t: Scalar, y: Y, given: Relays = None) -> An
     return model.state_at(t, y, tuple(modes))
 
 
-@eqx.filter_jit
+@interactive
 def settle_down(
     system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrator: Integrator
 ) -> tuple[Y, Scalar, Bool[Array, ""], Relays]:
@@ -130,7 +130,7 @@ def settle_down(
     return last.y1, period, rests, of_relays(system, last.mode1)
 
 
-@eqx.filter_jit
+@interactive
 def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
     """Whether an equilibrium of the sliding field is one of a continuum: on the surfaces that hold it the derivative of
     the field is singular."""
@@ -163,7 +163,7 @@ def held_throughout(system: System, begin: Array, end: Array, modes: Array) -> B
     return jnp.any(jnp.asarray(free, length.dtype) <= 1e-3 * jnp.sum(length))
 
 
-@eqx.filter_jit
+@interactive
 def repeats_held(
     system: System, t0: Scalar, y: Y, period: Scalar, mode: Any, integrator: Integrator
 ) -> Bool[Array, ""]:
@@ -191,7 +191,7 @@ def _laps(
     return last, at_last, jnp.concatenate([ravel(first.y1)[None], later])
 
 
-@eqx.filter_jit
+@interactive
 def repeats(
     system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrator: Integrator, most: int = 16
 ) -> Int[Array, ""]:

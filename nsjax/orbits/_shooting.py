@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._numerics._autodiff import frozen
+from .._numerics._compile import interactive
 from .._numerics._root import find_root, Newton
 from .._types import Scalar, Y
 from ..derivatives._floquet import floquet, forwards, structural_zeros
@@ -73,7 +74,7 @@ class Shooting(NamedTuple):
         return jnp.exp(z[1]) if system.period is None else jnp.asarray(system.period, z[0].dtype) * self.order
 
 
-@eqx.filter_jit
+@interactive
 def _shoot(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any) -> Orbit:
     sign, integrator, tol = shooting.sign, shooting.integrator, shooting.newton.tol
     autonomous = system.period is None

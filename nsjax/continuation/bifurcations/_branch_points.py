@@ -10,11 +10,11 @@ a critical value at single values of a further parameter else.
 import dataclasses
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array
 
+from ..._numerics._compile import interactive
 from ...orbits.segments._equations import OrbitCurve, row_sizes
 from ...orbits.segments._itinerary import OrbitItinerary
 from ..orbits._test_functions import Test
@@ -26,7 +26,7 @@ ISOLATED = 1e-2  # curvature of β along the curve, over that across it: zero wh
 EXACT = 1e-11
 
 
-@eqx.filter_jit
+@interactive
 def _equations(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, origin: Array) -> tuple[Array, Array]:
     def residual(u: Array) -> tuple[Array, Array]:
         f = curve.residual(u, itinerary, origin)[0]

@@ -5,12 +5,12 @@ import abc
 import dataclasses
 from typing import Any, Self
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..._numerics._compile import interactive
 from ...derivatives._floquet import trivial
 from ...orbits.segments._equations import linearised, OrbitCurve
 from ...orbits.segments._itinerary import capacity_for, EVENT, GRAZING, OrbitItinerary, Start
@@ -230,7 +230,7 @@ def cleared(curve: OrbitCurve, spot: OrbitPoint) -> OrbitPoint:
     return dataclasses.replace(spot, look=look._replace(least=least, where=where, spots=spots))
 
 
-@eqx.filter_jit
+@interactive
 def _guards_along(
     curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary, row: Array, orders: Array
 ) -> tuple[Array, Array, Array]:

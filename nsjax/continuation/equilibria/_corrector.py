@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from ..._numerics._compile import interactive
 from ..._numerics._linalg import bialternate
 from ..._numerics._root import find_root, Newton
 
@@ -115,7 +116,7 @@ def _corrected(curve: Curve, origin: Array, tangent: Array, s: Array, guess: Arr
     return find_root(residual, guess, None, Newton(TOLERANCE, 12))
 
 
-@eqx.filter_jit
+@interactive
 def step_along(curve: Curve, u: Array, tangent: Array, s: Array, mode: Array) -> Step:
     """One step of length `s` along the curve."""
     end, good = _corrected(curve, u, tangent, s, u + s * tangent, mode)
@@ -135,7 +136,7 @@ class Place(NamedTuple):
     good: Bool[Array, ""]
 
 
-@eqx.filter_jit
+@interactive
 def locate(
     curve: Curve, step: Step, origin: Array, tangent: Array, ends: Array, mode: Array, which: Array, *, slope: Array
 ) -> Place:
@@ -171,7 +172,7 @@ def locate(
     return Place(s, u, arriving, probe.values[which], good)
 
 
-@eqx.filter_jit
+@interactive
 def on_surface(curve: Curve, u: Array, mode: Array, which: Array) -> Array:
     """The point of the curve, next to `u`, at which a guard vanishes."""
 
@@ -182,7 +183,7 @@ def on_surface(curve: Curve, u: Array, mode: Array, which: Array) -> Array:
     return jnp.where(good, found, u)
 
 
-@eqx.filter_jit
+@interactive
 def branch_point(curve: Curve, u: Array, mode: Array) -> tuple[Array, Bool[Array, ""]]:
     """A simple branch point near `u`: with ψ the left null vector of DF, F + β ψ = 0, ψᵀ DF = 0, |ψ| = 1 are regular
     equations there, where F = 0 itself is not; Moore (1980)."""
@@ -197,13 +198,13 @@ def branch_point(curve: Curve, u: Array, mode: Array) -> tuple[Array, Bool[Array
     return u, good & (jnp.abs(beta) < 1e-9)
 
 
-@eqx.filter_jit
+@interactive
 def linearised(curve: Curve, u: Array, mode: Array) -> tuple[Array, Array]:
     """F and DF."""
     return curve.residual(u, mode), jax.jacfwd(curve.residual)(u, mode)
 
 
-@eqx.filter_jit
+@interactive
 def row_sizes(curve: Curve, u: Array, mode: Array) -> Array:
     """Of the rows of DF: what they have, or would have a unit further on, where all of a row vanishes here."""
     first = jax.jacfwd(curve.residual)
@@ -211,7 +212,7 @@ def row_sizes(curve: Curve, u: Array, mode: Array) -> Array:
     return jnp.where(size > 0, size, 1)
 
 
-@eqx.filter_jit
+@interactive
 def branching(curve: Curve, u: Array, kernel: Float[Array, "2 n+1"], left: Array, mode: Array) -> Float[Array, "2 2"]:
     """ψᵀ D²F φ_i φ_j for the kernel φ_1, φ_2 of DF and ψ of its transpose: the branches through a simple branch point
     have the directions a φ_1 + b φ_2 on which this vanishes; Keller (1977)."""
@@ -223,5 +224,5 @@ def branching(curve: Curve, u: Array, kernel: Float[Array, "2 n+1"], left: Array
     return jnp.stack([jnp.stack(row) for row in jax.hessian(along, (0, 1))(zero, zero)])
 
 
-near = eqx.filter_jit(distances)
-kept = eqx.filter_jit(lambda curve, u, mode: curve.record(u, mode))
+near = interactive(distances)
+kept = interactive(lambda curve, u, mode: curve.record(u, mode))

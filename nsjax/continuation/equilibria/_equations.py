@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from ..._numerics._compile import interactive
 from ..._types import Scalar, Y
 from ...equilibria._equilibrium import (
     all_decay,
@@ -181,7 +182,7 @@ class EquilibriumCurve(Curve):
         return u
 
 
-@eqx.filter_jit
+@interactive
 def kinks(curve: EquilibriumCurve, u: Array) -> Bool[Array, " switches"]:
     """Which switches the field does not feel at this point, nor on account of an error of its place: where h vanishes
     it is continuous there, with a kink."""
@@ -196,7 +197,7 @@ def kinks(curve: EquilibriumCurve, u: Array) -> Bool[Array, " switches"]:
     return jnp.all(jnp.abs(jumps) <= KINK * slopes, axis=0)
 
 
-@eqx.filter_jit
+@interactive
 def first_lyapunov_coefficient(curve: EquilibriumCurve, u: Array, mode: Array) -> Float[Array, ""]:
     """Whether the periodic orbits at a Hopf point are stable (negative) in the plane of the pair, by derivatives up to
     the third of the field; Kuznetsov (2004), eq. (5.34)."""

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._numerics._autodiff import dense_jacobian
+from ..._numerics._compile import interactive
 from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, THETA
 from ..._numerics._text import between, shown, written
 from ..._types import Scalar, Y
@@ -179,7 +180,7 @@ def flows_of(system: System, arcs: Arcs, integrator: Integrator) -> tuple[Flows,
     return Flows(system, within, arcs.begin[0], y0, x.shape[1], integrator), x
 
 
-@eqx.filter_jit
+@interactive
 def path_of(system: System, arcs: Arcs, samples: int, integrator: Integrator) -> Path:
     """States along the arcs."""
     flows, x = flows_of(system, arcs, integrator)

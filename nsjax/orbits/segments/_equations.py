@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..._numerics._compile import interactive
 from ..._types import Scalar, Y
 from ...flow._integrator import Integrator
 from ...system._impact import impact
@@ -195,7 +196,7 @@ def row_sizes(df: Array) -> Array:
     return jnp.where(sizes < VANISHES, 1, sizes)
 
 
-@eqx.filter_jit
+@interactive
 def state_at(curve: OrbitCurve, value: Array, a: Scalar, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
     """The state at a time in a segment. (Between steps the states of a `PointData` are those of the solver's dense
     output, less exact than the steps.)"""
@@ -207,7 +208,7 @@ def linearised(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> Array:
     return _linearised(curve.on(itinerary), itinerary, u)
 
 
-@eqx.filter_jit
+@interactive
 def _linearised(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> Array:
     df = jax.jacfwd(lambda v: curve.residual(v, itinerary, u)[0])(u)
     return df / row_sizes(df)[:, None]

@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..._numerics._compile import interactive
 from ..._types import Scalar, Y
 from ...derivatives._saltation import after_event
 from ...derivatives._variational import arcs
@@ -155,7 +155,7 @@ def _mode(names: list[str], mode: Any) -> tuple[int, ...]:
     return values
 
 
-@eqx.filter_jit
+@interactive
 def cuts_near(
     system: System, t0: Scalar, y0: Y, period: Scalar, order: int, mode: Any, integrator: Integrator
 ) -> tuple[SegmentGuess, Bool[Array, ""]]:

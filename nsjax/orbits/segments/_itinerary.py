@@ -4,13 +4,13 @@ import math
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..._numerics._compile import interactive
 from ..._types import Scalar, Y
 from ...flow._solution import Events
 from ...system._model import SwitchedSystem
@@ -119,7 +119,7 @@ class EventRecord(NamedTuple):
         return jax.tree.map(lambda *rows: np.concatenate(rows), self, other)
 
 
-@eqx.filter_jit
+@interactive
 def _looked_at(model: SwitchedSystem, like: Y, systems: System, diaries: EventRecord) -> tuple[Array, Array, Array]:
     """At each event of each orbit the component of every h that is nearest to zero, before it and after; and the
     multiplier of the switch that has it."""

@@ -2,13 +2,13 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from ..._numerics._compile import interactive
 from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, RESOLVED
 from ..._numerics._root import find_root, Newton
 from ..._types import Scalar
@@ -98,7 +98,7 @@ def correct(
     return _correct(curve.on(itinerary), itinerary, plane, guess, np.asarray(newton))
 
 
-@eqx.filter_jit
+@interactive
 def _correct(curve: OrbitCurve, itinerary: OrbitItinerary, plane: Plane, guess: Array, newton: Array) -> PointData:
     return corrected(curve, itinerary, plane, guess, newton)
 
@@ -224,7 +224,7 @@ def _infinitely_unstable(n: int, autonomous: bool) -> tuple[Array, Array, Array]
     return jnp.full((n, n), jnp.inf), jnp.array([jnp.inf, *rest], complex), jnp.array(False)
 
 
-@eqx.filter_jit
+@interactive
 def extremes(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> tuple[Array, Array]:
     """The least and the largest value of each component of the state along an orbit."""
     found = _along(curve, itinerary, u, turns=True, guards=False).least

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._numerics._compile import interactive
 from ..._numerics._minima import NODES, THETA, WEIGHTS
 from ..._types import Scalar, Y
 from ...flow._integrator import Integrator
@@ -91,7 +92,7 @@ def exactness(model: SwitchedSystem, t: Scalar, y: Y) -> int:
     return ALWAYS if all(affine_parts(lambda t, y: model.flow(t, y, state), t, y)) else FREE_MODES
 
 
-@eqx.filter_jit
+@interactive
 def fits(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> Array:
     """Whether the forcing along a segment is of a kind that the exponential knows: at several times, as at one where
     its odd derivatives vanish two frequencies look like one."""

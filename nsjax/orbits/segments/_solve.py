@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from ..._numerics._autodiff import frozen
+from ..._numerics._compile import interactive
 from ..._numerics._root import find_root, Newton
 from ..._types import Scalar, Y
 from ...derivatives._floquet import floquet, forwards, structural_zeros
@@ -136,7 +137,7 @@ class _Cycle(eqx.Module):
         )
 
 
-@eqx.filter_jit
+@interactive
 def by_segments(
     system: System,
     cuts: SegmentGuess,

@@ -7,12 +7,12 @@ no finite distance would do.
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 
+from ...._numerics._compile import interactive
 from ....flow._results import is_okay
 from ....flow._solution import Events
 from ....flow._solve import integrate
@@ -57,7 +57,7 @@ class ReturnMap(NamedTuple):
     jumps: bool
 
 
-@eqx.filter_jit
+@interactive
 def follow(
     curve: OrbitCurve, xs: Any, values: Any, reference: Any, begin: Any, end: Any, modes: Any
 ) -> tuple[jax.Array, jax.Array, Events, jax.Array]:

@@ -1,0 +1,32 @@
+"""Compiled programs, kept from one command to the next."""
+
+import os
+import pathlib
+import sys
+
+import jax
+
+
+def cache_folder() -> pathlib.Path:
+    """Where programs of this user keep what can be made again."""
+    home = pathlib.Path.home()
+    if sys.platform == "win32":
+        base = pathlib.Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local"))
+    elif sys.platform == "darwin":
+        base = home / "Library" / "Caches"
+    else:
+        base = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")
+    return base / "nsjax"
+
+
+def keep_programs() -> None:
+    """Compiled programs are written to the user's cache, unless JAX was told of another place for them."""
+    if jax.config.values.get("jax_compilation_cache_dir"):
+        return
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # a home that cannot be written to: every command compiles for itself
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

@@ -1,0 +1,67 @@
+"""Programs that are compiled for a few calls, and so as fast as may be."""
+
+import contextlib
+import functools as ft
+import gc
+from collections.abc import Callable, Iterator
+from typing import Any, cast, TypeVar
+
+import equinox as eqx
+import jax
+
+
+try:
+    from jax._src.core import trace_state_clean
+except ImportError:  # then nothing is known of the calls around this one
+
+    def trace_state_clean() -> bool:
+        return False
+
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+# The older emitters of XLA's CPU compiler take half of the time. In batches their programs are slower: those are
+# compiled by the user's own `jax.jit`, or by `nsjax.sweep`, without them.
+QUICK = {"xla_cpu_use_fusion_emitters": False}
+
+
+@ft.cache
+def _options() -> dict[str, Any]:
+    """Those of `QUICK` that this version of XLA knows."""
+    known = {}
+    for name, value in QUICK.items():
+        with contextlib.suppress(Exception):
+            jax.jit(lambda x: x).lower(0.0).compile({name: value})
+            known[name] = value
+    return known
+
+
+@contextlib.contextmanager
+def without_collection() -> Iterator[None]:
+    """Tracing makes millions of small objects that live on: looking for garbage among them takes a third of its
+    time."""
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
+
+
+def interactive(fn: F) -> F:
+    """`equinox.filter_jit` for what a user calls and waits for: compiled quickly, where it is not part of another
+    program."""
+    jit: Any = eqx.filter_jit
+    inner, outer = jit(fn), []
+
+    @ft.wraps(fn)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        if not trace_state_clean():
+            return inner(*args, **kwargs)
+        if not outer:
+            outer.append(jit(fn, compiler_options=_options()) if _options() else inner)
+        with without_collection():
+            return outer[0](*args, **kwargs)
+
+    return cast(F, call)

@@ -1,0 +1,58 @@
+"""Programs for a user who waits: compiled quickly, and the same as any other within other programs."""
+
+import gc
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nsjax._numerics import _compile
+from nsjax._numerics._compile import interactive, without_collection
+
+
+def test_the_same_within_other_programs():
+    """XLA allows options of its compiler at the outermost program only; what is within another has none."""
+    traced = []
+
+    @interactive
+    def fn(x, power):
+        traced.append(gc.isenabled())
+        return jnp.sum(jnp.sin(x) ** power)
+
+    x = jnp.arange(3.0)
+    value, slope = np.sum(np.sin(x) ** 2), 2 * np.sin(x) * np.cos(x)
+    assert gc.isenabled()
+    np.testing.assert_allclose(fn(x, 2), value, rtol=1e-14)
+    np.testing.assert_allclose(fn(x, power=2), value, rtol=1e-14)
+    assert traced[0] is False and gc.isenabled()  # while it is traced nothing is collected
+    np.testing.assert_allclose(jax.jit(lambda x: fn(x, 2))(x), value, rtol=1e-14)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(lambda x: fn(x, 2)))(x), slope, rtol=1e-14)
+    np.testing.assert_allclose(jax.vmap(lambda x: fn(x, 2))(x[:, None]), np.sin(x) ** 2, rtol=1e-14)
+    count = len(traced)
+    fn(x + 1, 2)
+    assert len(traced) == count  # compiled once
+
+
+def test_collection_is_restored():
+    with pytest.raises(ZeroDivisionError), without_collection():
+        assert not gc.isenabled()
+        raise ZeroDivisionError
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        with without_collection():
+            pass
+        assert not gc.isenabled()  # as it was found
+    finally:
+        gc.enable()
+
+
+def test_options_that_xla_does_not_know_are_left_out(monkeypatch):
+    monkeypatch.setattr(_compile, "QUICK", _compile.QUICK | {"xla_no_such_option": True})
+    _compile._options.cache_clear()
+    try:
+        assert "xla_no_such_option" not in _compile._options()
+        np.testing.assert_allclose(interactive(lambda x: 2 * x)(jnp.ones(())), 2)
+    finally:
+        _compile._options.cache_clear()
