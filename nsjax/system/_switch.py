@@ -28,7 +28,7 @@ class AbstractSwitch(abc.ABC):
     which means their minimum (a surface with a corner, such as the support of section 3.5).
     """
 
-    modes: ClassVar[tuple[int, ...]] = ()  # those that a user may name
+    modes: ClassVar[tuple[int, ...]] = ()  # those that a user may name, in the order of the colours of their lines
     order: ClassVar[int] = 0  # which derivative of h its value can keep at zero, and so hold the solution; 0: none
     holding: ClassVar[int] = 0  # the mode in which it does so
 
