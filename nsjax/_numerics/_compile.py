@@ -53,15 +53,17 @@ def interactive(fn: F) -> F:
     """`equinox.filter_jit` for what a user calls and waits for: compiled quickly, where it is not part of another
     program."""
     jit: Any = eqx.filter_jit
-    inner, outer = jit(fn), []
+    within = jit(fn)
+
+    @ft.cache  # not on import: which options there are is found out by compiling
+    def alone() -> Any:
+        return jit(fn, compiler_options=_options())
 
     @ft.wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if not trace_state_clean():
-            return inner(*args, **kwargs)
-        if not outer:
-            outer.append(jit(fn, compiler_options=_options()) if _options() else inner)
+        if not trace_state_clean():  # the options can only be given to the outermost program
+            return within(*args, **kwargs)
         with without_collection():
-            return outer[0](*args, **kwargs)
+            return alone()(*args, **kwargs)
 
     return cast(F, call)

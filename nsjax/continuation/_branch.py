@@ -1,7 +1,8 @@
 """What branches have in common, be they of equilibria or of periodic orbits."""
 
+import abc
 import os
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import equinox as eqx
 import jax
@@ -14,7 +15,10 @@ from ._archive import Archive, save, Types
 from ._special_point import AbstractSpecialPoint
 
 
-class AbstractBranch(eqx.Module):
+SpecialT = TypeVar("SpecialT", bound=AbstractSpecialPoint)
+
+
+class AbstractBranch(eqx.Module, Generic[SpecialT]):
     """A curve of solutions over a parameter; see `Branch` and `OrbitBranch`."""
 
     saved: ClassVar[Types]  # the types of what a file holds
@@ -25,7 +29,7 @@ class AbstractBranch(eqx.Module):
     values: eqx.AbstractVar[Float[np.ndarray, " points"]]
     ys: eqx.AbstractVar[Y]
     stable: eqx.AbstractVar[Bool[np.ndarray, " points"]]
-    special: eqx.AbstractVar[tuple[Any, ...]]
+    special: eqx.AbstractVar[tuple[SpecialT, ...]]
     ends: eqx.AbstractVar[tuple[str, str]]
     others: eqx.AbstractVar[tuple[Any, ...]]
 
@@ -35,15 +39,15 @@ class AbstractBranch(eqx.Module):
         return (self, *self.others)
 
     @property
-    def special_points(self) -> tuple[Any, ...]:
+    def special_points(self) -> tuple[SpecialT, ...]:
         """Those of all branches, each once, in the order of the parameter."""
-        found: dict[int, AbstractSpecialPoint] = {}
+        found: dict[int, SpecialT] = {}
         for branch in self.branches:
             found |= {id(b): b for b in branch.special}
         return tuple(sorted(found.values(), key=lambda b: b.value))
 
     @property
-    def bifurcations(self) -> tuple[Any, ...]:
+    def bifurcations(self) -> tuple[SpecialT, ...]:
         """Those of them that are bifurcations."""
         return tuple(b for b in self.special_points if b.is_bifurcation)
 
@@ -83,10 +87,12 @@ class AbstractBranch(eqx.Module):
                 seen.append(special)
         return "\n".join(lines)
 
+    @abc.abstractmethod
     def _headline(self) -> str:
-        raise NotImplementedError
+        """How many branches of what."""
 
     def _period(self) -> str:
+        """What tells this branch from others over the same interval."""
         return ""
 
     def _words(self) -> list[str]:

@@ -1,11 +1,9 @@
 """What special points of branches have in common, be the branches of equilibria or of periodic orbits."""
 
-from collections.abc import Sequence
+import abc
 from typing import ClassVar
 
 import equinox as eqx
-
-from ..setvalued._crossing import EigenvalueCrossing
 
 
 class AbstractHalfBranch(eqx.Module):
@@ -28,7 +26,6 @@ class AbstractSpecialPoint(eqx.Module):
     discontinuous: eqx.AbstractVar[bool]
     criticality: eqx.AbstractVar[str | None]
     value: eqx.AbstractVar[float]
-    crossings: eqx.AbstractVar[Sequence[EigenvalueCrossing]]
 
     @property
     def is_bifurcation(self) -> bool:
@@ -46,6 +43,6 @@ class AbstractSpecialPoint(eqx.Module):
         words = ["discontinuous"] * self.discontinuous + [self.kind, "bifurcation"]
         return " ".join(words) + (f", {self.criticality}" if self.criticality else "")
 
+    @abc.abstractmethod
     def _what_happens(self) -> str:
         """At a point that is no bifurcation."""
-        raise NotImplementedError

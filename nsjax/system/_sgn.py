@@ -75,12 +75,11 @@ class sgn(AbstractSwitch):
         return [jnp.where(mode < 0, one, alone)]
 
     def bound_guard(self, model: "SwitchedSystem", slot: Slot, value: Scalar, state: ModeState) -> Scalar:
-        k, sign = slot.switch, slot.part
-        left = model.bound(k) - sign * value
+        left = super().bound_guard(model, slot, value, state)
         if not self.static:
             return left
         # Held backwards with |λ| > 1 it is let go where |λ| falls to 1, see `SwitchedSystem.edge`.
-        return jnp.where(state.roots[k] * sign <= -BEYOND, -sign * value - 1, left)
+        return jnp.where(state.roots[slot.switch] * slot.part <= -BEYOND, -slot.part * value - 1, left)
 
     def known_row(self, model: "SwitchedSystem", slot: Slot, roots: Any, state: ModeState) -> list[Int[Array, ""]]:
         k, j = slot.switch, slot.part

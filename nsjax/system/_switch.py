@@ -104,7 +104,7 @@ class AbstractSwitch(abc.ABC):
 
     def bound_guard(self, model: "SwitchedSystem", slot: Slot, value: Scalar, state: ModeState) -> Scalar:
         """How far its value is from the bound at which it ceases to hold."""
-        raise NotImplementedError
+        return model.bound(slot.switch) - slot.part * value
 
     def known_row(self, model: "SwitchedSystem", slot: Slot, roots: Any, state: ModeState) -> list[Int[Array, ""]]:
         """How many roots each entry of `guard_row` has at the present instant, of `roots` that its surface has."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from affine import Affine
 from exact import Case, Shape
-from trajectory import count, share, slopes_agree, Solved, tightly, told_but_ambiguous
+from trajectory import assert_slopes_agree, count, share, Solved, tightly, told_but_ambiguous
 
 
 # One compiled program each.
@@ -83,6 +83,6 @@ def test_many_random_systems(name, derive):
 def test_the_oracle_against_itself(name):
     """Its derivatives, by saltation matrices, are those of its solutions."""
     shape = SHAPES[name][0]
-    slopes_agree(
+    assert_slopes_agree(
         functools.partial(exact.generate, shape=shape), lambda case: exact.solve(case, shape, MAX_EVENTS), 12, 6
     )

@@ -15,7 +15,7 @@ import pytest
 from curved import Case, Shape
 from jaxtyping import Array
 from scipy.integrate import solve_ivp
-from trajectory import count, share, slopes_agree, Solved, tightly, told_but_ambiguous
+from trajectory import assert_slopes_agree, count, share, Solved, tightly, told_but_ambiguous
 
 import nsjax
 
@@ -164,6 +164,6 @@ def test_the_series_of_the_reference():
 def test_the_reference_against_itself(name):
     """What errors grow by, from saltation matrices, is what its solutions depart from each other by."""
     shape = SHAPES[name][0]
-    slopes_agree(
+    assert_slopes_agree(
         functools.partial(curved.generate, shape=shape), lambda case: curved.solve(case, shape, MAX_EVENTS), 4, 2
     )

@@ -238,7 +238,7 @@ def told_but_ambiguous(tally: collections.Counter) -> int:
     return tally["needlessly told"] - tally["needlessly told ambiguous"]
 
 
-def slopes_agree(generate, solve, number: int, least: int) -> None:
+def assert_slopes_agree(generate, solve, number: int, least: int) -> None:
     """The derivatives of a reference, from saltation matrices, are those of its solutions: of so many cases, at least
     so many of which can be compared."""
     rng, compared = np.random.default_rng(0), 0

@@ -72,11 +72,7 @@ class Bifurcation(AbstractSpecialPoint):
     - `orbits`: how many of them were found below and above; None if they were not looked for. See `hopf_orbits`.
     """
 
-    plain = {
-        "hysteresis point": "hysteresis point",
-        "end": "end",
-        "continuum": "continuum of equilibria",
-    }
+    plain = {"hysteresis point": "hysteresis point", "end": "end", "continuum": "continuum of equilibria"}
 
     kind: str
     discontinuous: bool

@@ -20,7 +20,7 @@ CLOSED = "the start: it is closed"
 
 
 @shown
-class Branch(AbstractBranch):
+class Branch(AbstractBranch[Bifurcation]):
     """A curve of equilibria over a parameter.
 
     **Attributes:**

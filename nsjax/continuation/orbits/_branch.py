@@ -27,7 +27,7 @@ from ._tracer import midpoint, OrbitPoint
 
 
 @shown
-class OrbitBranch(AbstractBranch, Generic[StateT]):
+class OrbitBranch(AbstractBranch[OrbitBifurcation], Generic[StateT]):
     """A curve of periodic orbits over a parameter.
 
     **Attributes:**
