@@ -21,7 +21,7 @@ from .._numerics._lane_cond import compact_cond
 from .._types import Scalar, Y
 from ..system._mode import BEYOND, ModeState
 from ..system._model import SwitchedSystem
-from ._results import RESULTS
+from ._results import promoted, RESULTS
 from ._save import Log, Saved
 from .events._attraction import escapes
 from .events._locate import Interval
@@ -108,7 +108,7 @@ class Flow(eqx.Module):
         step = stepper(model, c.state, c.t, t_next, c.y, c.f, Watch(self.affine, self.controller))
         t_next = step.t_next
         keep, dt, controller, outcome = self.pace(c, step)
-        halvings, result, touches = c.halvings, RESULTS.promote(outcome), []
+        halvings, result, touches = c.halvings, promoted(outcome), []
         if step.fits is not True:
             result = RESULTS.where(step.fits, result, RESULTS.mode_not_affine)
         busy = jnp.zeros((), bool)

@@ -128,6 +128,11 @@ class SolveError(RuntimeError):
     `throw=False` nothing is raised, and `result` tells."""
 
 
+def promoted(result: Any) -> RESULTS:
+    """One of diffrax's as one of ours. (`RESULTS.promote` compiles eight small programs for what is known.)"""
+    return RESULTS.successful if result is dfx.RESULTS.successful else RESULTS.promote(result)
+
+
 def raise_if(bad: Bool[Array, ""], result: RESULTS, tree: Any) -> Any:
     """`tree`, if not `bad`, else an error with the message of `result`. Derivatives raise it too: whoever wants these
     alone computes nothing else, and would be given what belongs to a solution that failed."""

@@ -93,6 +93,13 @@ def _flow(
     def guard(i: int, ty: tuple[Scalar, Y]) -> list[Scalar]:
         return model.guards(*ty, state, wanted=tuple(j == i for j in slots))[i]
 
+    def origin(i: int, ty: tuple[Scalar, Y]) -> Any:
+        """What a guard is made of: where multipliers are solved for, comparisons say nothing of jumps."""
+        if not model.slots[i].holding:
+            return guard(i, ty)
+        k = model.slots[i].switch
+        return model.rates(model.holdable, *ty, state, model.signs(ty[0], state)), model.bound(k)
+
     affine = tuple(is_affine(ft.partial(guard, i), (t, y)) for i in slots)
     return Flow(
         model=model,
@@ -106,7 +113,7 @@ def _flow(
         want_points=options.saveat.dense or request.ts is not None,
         meter=options.meter,
         affine=affine,
-        jumpy=tuple(not affine[i] and may_jump(ft.partial(guard, i), (t, y)) for i in slots),
+        jumpy=tuple(not affine[i] and may_jump(ft.partial(origin, i), (t, y)) for i in slots),
         reverse=isinstance(integrator.adjoint, dfx.RecursiveCheckpointAdjoint),
     )
 
@@ -177,8 +184,9 @@ def _looped(flow: Flow, carry: Carry, adjoint: dfx.AbstractAdjoint) -> Carry:
     kind = dict(kind="lax")
     if isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
         kind = dict(kind="checkpointed", max_steps=flow.max_steps, checkpoints=adjoint.checkpoints)
-    # `unvmap_any` keeps the predicate unbatched, so that ended lanes cost no copy of the buffers.
-    dynamic = eqxi.while_loop(lambda c: eqxi.unvmap_any(c.active), body, dynamic, **kind)
+    # `unvmap_any` keeps the predicate unbatched, so that ended lanes cost no copy of the buffers. Where it depends on one
+    # number of the carry alone, XLA looks for a count of the turns in it, which takes a quarter of the compilation.
+    dynamic = eqxi.while_loop(lambda c: eqxi.unvmap_any(c.active & (c.steps >= 0)), body, dynamic, **kind)
     c: Carry = eqx.combine(dynamic, static)
     flow.meter.close(c.meter)
     return c
