@@ -53,6 +53,35 @@ class Hitting(Rubbing):
         return 0.8
 
 
+class ThreeSurfaces(nsjax.System):
+    """A forced oscillator with three switches, one of which has a surface with a corner."""
+
+    k: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -self.k * y.x - s.belt - 0.3 * s.corner - 0.2 * s.place + jnp.cos(t))
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y.v - 0.2
+
+    @belt.breakaway
+    def belt(self):
+        return 1.5
+
+    @nsjax.sgn
+    def corner(self, t, y):
+        return y.x - 1.0, y.x + y.v - 1.0
+
+    @nsjax.sgn
+    def place(self, t, y):
+        return y.x + 2.0
+
+    @property
+    def period(self):
+        return 2 * jnp.pi
+
+
 class Toggle(nsjax.System):
     """x'' = -2 rate sgn(x): from (0, 1) it crosses x = 0 `rate` times a unit of time."""
 

@@ -77,8 +77,13 @@ def _masks(jaxpr: Any, inputs: list[np.ndarray], jumps: list[str] | None = None)
 
 def is_constant(fn: Callable[[Any], Any], x: Any) -> bool:
     """Whether `fn` is structurally independent of `x`, entry by entry: a state may be one array or several leaves."""
+    return not any(touched(fn, x))
+
+
+def touched(fn: Callable[[Any], Any], x: Any) -> list[bool]:
+    """Which leaves of `fn(x)` depend on `x`."""
     jaxpr = jax.make_jaxpr(fn)(x).jaxpr
-    return not any(m.any() for m in _masks(jaxpr, [np.ones(v.aval.shape, bool) for v in jaxpr.invars]))
+    return [bool(m.any()) for m in _masks(jaxpr, [np.ones(v.aval.shape, bool) for v in jaxpr.invars])]
 
 
 def is_affine(fn: Callable[[Any], Any], x: Any) -> bool:

@@ -1,11 +1,26 @@
 """Small matrices: their products, and systems of linear equations."""
 
+import itertools
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar
+from ._autodiff import frozen
+
+
+WRITTEN_OUT = 3
+
+Row: TypeAlias = list[Scalar] | Float[Array, " m"]
+"""Up to `WRITTEN_OUT` numbers are scalars, of which XLA makes fewer kernels; more are an array."""
+
+
+def row(numbers: Sequence[Any]) -> Any:
+    return jnp.stack(list(numbers)) if len(numbers) > WRITTEN_OUT else list(numbers)
 
 
 def product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
@@ -16,30 +31,44 @@ def product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m
 
 
 def linear_solve(a: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
-    """x with a x = b.
+    """x with a x = b; see `solve_rows`."""
+    m = len(b)
+    if m > WRITTEN_OUT:
+        return solve_rows(list(a), b)
+    return jnp.stack(solve_rows([[a[i, j] for j in range(m)] for i in range(m)], [b[i] for i in range(m)]))
+
+
+def solve_rows(rows: list[Any], right: Any) -> Any:
+    """x with a x = b, by the rows of a; b and x are rows, too.
 
     Up to three unknowns by Cramer's rule, which XLA vectorises over the lanes of a batch, where it would call LAPACK
     for each. (Sweeps with two multipliers take a fourteenth of the time, with three a sixth. Elimination written out
     takes twice as long to compile and run, and with five is no faster than LAPACK.) Scaling rows or columns is no
     matter.
     """
-    m = len(b)
-    if m > 3:
-        rows, columns = _scales(lax.stop_gradient(a))
-        return columns * jnp.linalg.solve(rows[:, None] * a * columns, rows * b)
-    columns = [[a[i, j] for i in range(m)] for j in range(m)]
-    right = [b[i] for i in range(m)]
+    m = len(right)
+    if m > WRITTEN_OUT:
+        a = jnp.stack(rows)
+        by_row, by_column = _scales(lax.stop_gradient(a))
+        return by_column * jnp.linalg.solve(by_row[:, None] * a * by_column, by_row * right)
+    columns = [[row[j] for row in rows] for j in range(m)]
     whole = _determinant(columns)
-    return jnp.stack([_determinant([*columns[:j], right, *columns[j + 1 :]]) / whole for j in range(m)])
+    return [_determinant([*columns[:j], right, *columns[j + 1 :]]) / whole for j in range(m)]
 
 
-def parallel(a: Float[Array, " m"], b: Float[Array, " m"]) -> Bool[Array, ""]:
+def parallel(a: Any, b: Any) -> Bool[Array, ""]:
     """Whether two rows are multiples of one another apart from rounding, whatever the units of rows and columns: all
     minors a_i b_j - a_j b_i vanish beside their two terms."""
-    a, b = lax.stop_gradient((a, b))
-    outer = a[:, None] * b[None, :]
-    size = jnp.abs(outer)
-    return jnp.all(jnp.abs(outer - outer.T) <= nearly(a) * (size + size.T))
+    a, b = frozen((a, b))
+    if len(a) > WRITTEN_OUT:
+        outer = a[:, None] * b[None, :]
+        size = jnp.abs(outer)
+        return jnp.all(jnp.abs(outer - outer.T) <= nearly(outer) * (size + size.T))
+    out = jnp.ones((), bool)
+    for i, j in itertools.combinations(range(len(a)), 2):
+        p, q = a[i] * b[j], a[j] * b[i]
+        out = out & (jnp.abs(p - q) <= nearly(p) * (jnp.abs(p) + jnp.abs(q)))
+    return out
 
 
 def nearly(like: Array) -> float:

@@ -139,8 +139,8 @@ def minima(
         x_next = jnp.where(rough, walk.x, xs[-1])
         return _Walk(begin, jnp.minimum(width, 1 - begin), x_next, seen, found)
 
-    # (One that is not a number is not rough: it ends. Of a condition on `begin` alone XLA looks for a count of the turns,
-    # which takes long.)
+    # (One that is not a number is not rough: it ends. Of a condition on one number XLA would look for a count of the
+    # turns, which takes long.)
     return lax.while_loop(lambda walk: (walk.begin < 1) & (walk.width > 0), step, start).minima
 
 

@@ -20,6 +20,23 @@ class Newton(NamedTuple):
     tol: Any  # relative and absolute, of the unknowns
     max_iterations: int
 
+    def solver(self, well_posed: bool | None = None) -> optx.Newton:
+        return optx.Newton(rtol=self.tol, atol=self.tol, linear_solver=lx.AutoLinearSolver(well_posed=well_posed))
+
+    def step(self, z: Array, residual: Array, jacobian: Array) -> tuple[Array, Bool[Array, ""], Bool[Array, ""]]:
+        """One step of `find_root`, where residual and Jacobian are known: where it leads, whether the search ends
+        there, and whether it has converged."""
+
+        def linear(x: Array, _: Any) -> tuple[Array, None]:
+            return residual + jacobian @ (x - z), None
+
+        solver = self.solver()
+        state = solver.init(linear, z, None, {}, jax.eval_shape(lambda: residual), None, frozenset())
+        new, state, _ = solver.step(linear, z, None, {}, state, frozenset())
+        ended, result = solver.terminate(linear, new, None, {}, state, frozenset())
+        finite = jnp.all(jnp.isfinite(new))
+        return new, ended | ~finite, ended & finite & (result == optx.RESULTS.successful)
+
 
 def find_root(
     residual: Callable[[Any, Any], Any],
@@ -38,7 +55,7 @@ def find_root(
     """
     found = optx.root_find(
         lambda z, p: dense_jacobian(residual, z, p),
-        optx.Newton(rtol=newton.tol, atol=newton.tol, linear_solver=lx.AutoLinearSolver(well_posed=well_posed)),
+        newton.solver(well_posed),
         frozen(guess),
         args=frozen(parameters),
         max_steps=newton.max_iterations,

@@ -7,7 +7,7 @@ import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._compile import interactive
 from .._types import Scalar, Y
@@ -20,6 +20,9 @@ from ..flow._solve import integrate, solve
 from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, System
 from ._saltation import saltation_matrices
+
+
+AT_ONCE = 1e-9  # of the whole time: so near to the start an event happens at it
 
 
 def fundamental_matrix(
@@ -109,8 +112,20 @@ def arcs(sol: Solution, t0: Scalar, y0: Y) -> tuple[Array, Array, Y, Array]:
 
 
 def monodromy_by_arcs(system: System, sol: Solution, t0: Scalar, y0: Y, integrator: Integrator) -> Float[Array, "n n"]:
-    """Φ at the end of `sol`, by the variational equation and the saltation formula."""
-    return _by_arcs(system, sol, t0, y0, sol.t1[None], integrator)[0]
+    """Φ at the end of `sol`, which comes back, by the variational equation and the saltation formula. An event at its
+    very start that happens again at its very end counts once."""
+    return _by_arcs(system, sol, t0, y0, sol.t1[None], integrator, _repeated(sol, t0))[0]
+
+
+def _repeated(sol: Solution, t0: Scalar) -> Int[Array, ""]:
+    """How many events at the very start lead to the mode of the end."""
+    if not sol.events.t.size:
+        return jnp.zeros_like(sol.events.num)
+    events, rows = sol.events, jnp.arange(sol.events.t.shape[0], dtype=sol.events.num.dtype)
+    at_once = (rows < events.num) & (jnp.abs(events.t - t0) <= AT_ONCE * jnp.abs(sol.t1 - t0))
+    same = at_once & jnp.all(events.mode_after == sol.mode1, axis=1)
+    closed = jnp.all(sol.mode0 == sol.mode1) | ~jnp.any(same)
+    return jnp.where(closed, 0, 1 + jnp.argmax(same)).astype(events.num.dtype)
 
 
 @interactive
@@ -121,9 +136,10 @@ def _by_arcs(
     y0: Y,
     times: Array,
     integrator: Integrator,
+    skipped: Int[Array, ""] | int = 0,
 ) -> tuple[Float[Array, "n n"], Float[Array, "times n n"]]:
     """Φ at the end of `sol`, with the jump of an event there, and at `times`, from the arcs between the events and the
-    jumps at these."""
+    jumps at these; those of the first `skipped` are left out."""
     flat, unravel = jfu.ravel_pytree(y0)
     model = SwitchedSystem.forwards(system, t0, y0)
     n = flat.size
@@ -131,7 +147,8 @@ def _by_arcs(
     begin, end, state, modes = arcs(sol, t0, y0)
     jumps = eye[None]
     if sol.events.t.size:
-        happened = jnp.arange(sol.events.t.size, dtype=sol.events.num.dtype) < sol.events.num
+        index = jnp.arange(sol.events.t.size, dtype=sol.events.num.dtype)
+        happened = (index >= skipped) & (index < sol.events.num)
         later = jnp.where(happened[:, None, None], saltation_matrices(system, sol.events), eye)
         jumps = jnp.concatenate([jumps, later])
 

@@ -6,6 +6,7 @@ for the segments of the others.
 
 import dataclasses
 import functools as ft
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -79,6 +80,7 @@ class Flow(eqx.Module):
     max_events: int = eqx.field(static=True)
     keep_steps: int = eqx.field(static=True)  # save every n-th step
     want_points: bool = eqx.field(static=True)
+    still: bool = eqx.field(static=True)  # whether only the state at the end has derivatives
     meter: dfx.AbstractProgressMeter
     affine: tuple[bool, ...] = eqx.field(static=True)  # whether each guard is affine in (t, y)
     jumpy: tuple[bool, ...] = eqx.field(static=True)  # whether each guard holds an operation that may jump
@@ -89,13 +91,20 @@ class Flow(eqx.Module):
         """Relative and absolute, of a step; NaN for steps of a given length."""
         return getattr(self.controller, "rtol", jnp.nan), getattr(self.controller, "atol", jnp.nan)
 
+    @property
+    def record(self) -> Callable[[Any], Any] | None:
+        """What is done to what dense output is made of, if it is wanted."""
+        if not self.want_points:
+            return None
+        return frozen if self.still else lambda tree: tree
+
     def land(self, step: Interval, touches: list) -> Transition:
         """The step once more, to its first event."""
         model = self.model.within(step.state.mode)
         *first, last = once(self.stepper.scaled(model, step.polynomials))
         polynomials = [*first, jnp.where(model.stacked(touches, False), jnp.minimum(last, 0), last)]
         step = step._replace(polynomials=polynomials, noise=model.stacked(step.noise, 0.0))
-        return transition(model, self.stepper, self.tolerance, self.want_points, self.t0, step)
+        return transition(model, self.stepper, self.tolerance, self.record, self.t0, step)
 
     def attempt(self, c: Carry) -> _Attempt:
         """A step of the solver, its error against the tolerance, and whether a guard may have a root on it."""
@@ -214,7 +223,7 @@ class Flow(eqx.Module):
         step = attempt.step
         t, no = step.t_next, jnp.zeros((), bool)
         y_end = model.project(t, step.y1, c.state)
-        points = stack(self.stepper.points(c.y, step.y1, step.ks)) if self.want_points else None
+        points = None if self.record is None else stack(self.stepper.points(*self.record((c.y, step.y1, step.ks))))
         end = Transition(
             found=no,
             t=t,
@@ -259,7 +268,8 @@ class Flow(eqx.Module):
             assert log is not None
             at, news = there.t_after * model.direction, event & there.news
             slot, mode = there.slot.astype(jnp.int32), jnp.stack(there.state.mode)
-            log = log.write(events, news, (at, there.y_before, there.y_after, slot, mode, there.transversality))
+            row = (at, there.y_before, there.y_after, slot, mode, there.transversality)
+            log = log.write(events, news, frozen(row) if self.still else row)
             grazed, forked = grazed | (event & there.grazes), forked | (moved & there.forked)
             events = events + news.astype(jnp.int32)
             halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(step.keep, 0, halted))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._numerics._text import between, known, shown, written
 from .._types import Scalar, StateT, Y
 from ..system._system import System
-from ._results import outcomes, RESULTS
+from ._results import is_okay, outcomes, RESULTS
 from .steppers._stepper import bernstein
 
 
@@ -215,6 +215,15 @@ class Solution(eqx.Module, Generic[StateT]):
         )
         near = f"\n  margin  {float(self.margin):.2g} tolerances: whether a surface was met is a matter of these"
         return text + near * bool(self.margin < 100) + "\n  not the only solution: see `unique`" * (not self.unique)
+
+    def within(self, max_events: int) -> "Solution[StateT]":
+        """The same with room for so many events; one that has more has failed."""
+        events, num = self.events, jnp.minimum(self.events.num, max_events)
+        rows = jax.tree.map(lambda x: x[:max_events], eqx.tree_at(lambda e: e.num, events, None))
+        full = (events.num > max_events) & is_okay(self.result)
+        result = RESULTS.where(full, RESULTS.max_events_reached, self.result)
+        short = eqx.tree_at(lambda e: e.num, rows, num, is_leaf=lambda x: x is None)
+        return eqx.tree_at(lambda s: (s.events, s.result), self, (short, result))
 
     @property
     def itinerary(self) -> Itinerary:

@@ -44,6 +44,7 @@ class _Options(NamedTuple):
     dt0: Scalar | None = None
     throw: bool = False
     meter: dfx.AbstractProgressMeter = dfx.NoProgressMeter()
+    still: bool = False  # whether only the state at the end has derivatives
 
 
 @interactive
@@ -111,6 +112,7 @@ def _flow(
         max_events=integrator.max_events if model.slots else 0,
         keep_steps=request.steps,
         want_points=options.saveat.dense or request.ts is not None,
+        still=options.still,
         meter=options.meter,
         affine=affine,
         jumpy=tuple(not affine[i] and may_jump(ft.partial(origin, i), (t, y)) for i in slots),
@@ -184,8 +186,8 @@ def _looped(flow: Flow, carry: Carry, adjoint: dfx.AbstractAdjoint) -> Carry:
     kind = dict(kind="lax")
     if isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
         kind = dict(kind="checkpointed", max_steps=flow.max_steps, checkpoints=adjoint.checkpoints)
-    # `unvmap_any` keeps the predicate unbatched, so that ended lanes cost no copy of the buffers. Where it depends on one
-    # number of the carry alone, XLA looks for a count of the turns in it, which takes a quarter of the compilation.
+    # `unvmap_any` keeps the predicate unbatched, so that ended lanes cost no copy of the buffers. Where it depends on
+    # one number of the carry alone, XLA looks for a count of the turns in it, which takes a quarter of the compilation.
     dynamic = eqxi.while_loop(lambda c: eqxi.unvmap_any(c.active & (c.steps >= 0)), body, dynamic, **kind)
     c: Carry = eqx.combine(dynamic, static)
     flow.meter.close(c.meter)
@@ -377,7 +379,9 @@ def integrate(
     *,
     mode: Any = None,
     saveat: dfx.SaveAt = dfx.SaveAt(t1=True),
+    still: bool = False,
 ) -> Solution:
-    """`solve` for arguments that have been checked, which never raises."""
-    options = _Options(given_modes(system, mode), integrator.with_arrays(t0.dtype), saveat)
+    """`solve` for arguments that have been checked, which never raises. `still`: only `y1` has derivatives, not what is
+    saved or logged on the way, which makes a smaller program."""
+    options = _Options(given_modes(system, mode), integrator.with_arrays(t0.dtype), saveat, still=still)
     return _run(arrays_of(system, t0.dtype), t0, jnp.asarray(t1, t0.dtype), y0, options)

@@ -6,7 +6,6 @@ from typing import Any, Literal
 import diffrax as dfx
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -115,7 +114,7 @@ def find_orbit(
     if throw:
         check_numbers(system, t0, t0, y0)
     system = arrays_of(system, t0.dtype)
-    concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, t0, y0, period)))
+    concrete = known((system, t0, y0, period, jnp.zeros(())))  # (under `jit` not even a constant is)
     _check_period(system, t0, y0, period, order, concrete)
     search = Search(
         t0=t0,

@@ -15,6 +15,7 @@ from .._types import Scalar, Y
 from ..derivatives._variational import arcs
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
+from ..flow._solution import Solution
 from ..flow._solve import integrate
 from ..system._clock import clock
 from ..system._model import SwitchedSystem
@@ -24,22 +25,36 @@ from ..system._system import System
 from ._orbit import distance, ravel
 
 
+LAPS = 2.5  # guessed periods, over which a better guess is looked for
+
+
 Relays = dict[str, Int[Array, ""]] | None
 
 
 def base_point(
     system: System, t0: Scalar, y0: Y, period: Scalar, sign: float, mode: Any, integrator: Integrator
 ) -> tuple[Y, Scalar, Relays]:
-    """A better guess, from the solution over two and a half guessed periods (backwards if `sign` is -1).
+    """A better guess, from the solution over some guessed periods (backwards if `sign` is -1).
 
     The base point is in the middle of the longest arc between events, on a smooth one if there is any: the flow map is
     only one-sided differentiable at an event, and the phase condition wants a transversal section. The period is the
     time after which the solution comes nearest to it again, among those within half the guess of it. Third, the modes
     of relays there, which within a hysteresis only the solution knows.
     """
-    end_time = t0 + sign * 2.5 * period
-    integrator = integrator._replace(max_events=3 * integrator.max_events)  # which is meant for one period
+    end_time = t0 + sign * LAPS * period
+    integrator = roomy(integrator)
     sol = integrate(system, t0, end_time, y0, integrator, mode=mode, saveat=dfx.SaveAt(dense=True))
+    return base_on(sol, t0, y0, period, sign)
+
+
+def roomy(integrator: Integrator) -> Integrator:
+    """The same with room for the events of several periods: its bound is meant for one."""
+    return integrator._replace(max_events=3 * integrator.max_events)
+
+
+def base_on(sol: Solution, t0: Scalar, y0: Y, period: Scalar, sign: float) -> tuple[Y, Scalar, Relays]:
+    """The base point from a solution that is known."""
+    system = sol.system
     begin, end, _, modes = arcs(sol, t0, y0)
     begin, end = (jnp.minimum(sign * (t - t0), period) for t in (begin, end))
     slides = jnp.stack(
@@ -61,6 +76,12 @@ def base_point(
 def of_relays(system: System, mode: Any) -> Relays:
     """Of a mode of all switches that of the relays, as an argument for `solve`."""
     return {k.name: mode[i] for i, k in enumerate(system.switches) if isinstance(k, relay)} or None
+
+
+@interactive
+def relays_at(system: System, t0: Scalar, y0: Y, given: Relays) -> Relays:
+    """The modes of relays at a state; within their hysteresis those that are given, or off."""
+    return of_relays(system, at_start(SwitchedSystem.forwards(system, t0, y0), t0, y0, given).mode)
 
 
 @interactive

@@ -125,7 +125,7 @@ class Search(NamedTuple):
         t0, integrator = self.t0, self.integrator
         if pieces is None:
             shooting = Shooting(order, self.symmetry, self.backward, integrator, self.newton)
-            return shooting.orbit(system, t0, y0, period, mode)
+            return shooting.orbit(system, t0, y0, period, mode, self.concrete)
         cuts, closes = cuts_near(frozen(system), t0, lax.stop_gradient(y0), period, order, mode, integrator)
         if self.concrete:  # without the rows that are only there to fill up
             cuts = cuts.first(int(cuts.num) + 1)

@@ -9,22 +9,23 @@ import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, Bool
 
 from .._numerics._autodiff import frozen
 from .._numerics._compile import interactive
 from .._numerics._root import find_root, Newton
 from .._types import Scalar, Y
 from ..derivatives._floquet import floquet, forwards, structural_zeros
-from ..derivatives._variational import arcs, monodromy_by_arcs
+from ..derivatives._variational import arcs, AT_ONCE, monodromy_by_arcs
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
-from ..flow._solution import Events
+from ..flow._solution import Events, Solution
 from ..flow._solve import integrate
 from ..system._model import SwitchedSystem
 from ..system._relay import relay
 from ..system._system import System
-from ._guess import at_start, base_point
+from ._guess import at_start, base_on, base_point, LAPS, relays_at, roomy
 from ._orbit import distance, fractions, judge, Orbit, ravel
 from .segments._arcs import Arcs
 
@@ -42,89 +43,212 @@ class Shooting(NamedTuple):
     def sign(self) -> float:
         return -1.0 if self.backward else 1.0
 
-    def orbit(self, system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any) -> Orbit:
-        """What Newton's method finds, and what is said of the orbit as it runs forwards."""
-        return _shoot(self, system, t0, y0, period, mode)
+    def orbit(self, system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any, concrete: bool) -> Orbit:
+        """What Newton's method finds, and what is said of the orbit as it runs forwards. Where all numbers are
+        `concrete` Python calls one small program several times; else all is one program, which has derivatives."""
+        search = _search if concrete else _searched
+        return search(self, system, t0, y0, jnp.asarray(period, t0.dtype), mode)
 
-    def equations(self, start: Y, period: Scalar, mode: Any, normal: Array | None) -> tuple[Any, Callable]:
-        """The unknowns, with their guess, and what vanishes: a function of them and of (system, t0). Of an autonomous
-        system the logarithm of the period is unknown too, and the base point stays on the section through the guess
-        that has this `normal`: Poincaré's phase condition."""
-        flat, unravel = jfu.ravel_pytree(start)
-        part = 1.0 if self.symmetry is None else 0.5
+    def period(self, x: Array, z: Array, system: System) -> Scalar:
+        """From the unknowns z, which begin with the state x."""
+        return jnp.exp(z[-1]) if system.period is None else jnp.asarray(system.period, x.dtype) * self.order
 
-        def returns(z: tuple, parameters: tuple) -> Array:
-            system, t0 = parameters
-            end = t0 + self.sign * part * self.period(z, system)
-            sol = integrate(system, t0, end, unravel(z[0]), self.integrator, mode=mode)
-            # A solution that ended early is no solution: Newton's method must not be led by it.
-            last = jnp.where(is_okay(sol.result), ravel(sol.y1), jnp.nan)
-            return last - (z[0] if self.symmetry is None else ravel(self.symmetry(unravel(z[0]))))
+    def unknowns(self, y0: Y, period: Scalar, autonomous: bool) -> Array:
+        """The state; of an autonomous system the logarithm of the period is unknown too."""
+        return jnp.append(ravel(y0), jnp.log(period)) if autonomous else ravel(y0)
 
-        if normal is None:
-            return (flat,), returns
-        speed = normal @ normal
+    @property
+    def part(self) -> float:
+        """Of the period, over which the equations integrate."""
+        return 1.0 if self.symmetry is None else 0.5
 
-        def on_section(z: tuple, parameters: tuple) -> tuple:
-            return returns(z, parameters), normal @ (z[0] - flat) / jnp.where(speed == 0, 1, speed)
+    def equations(self, z: Array, last: Array, section: "_Section | None", unravel: Callable[[Array], Y]) -> Array:
+        """What vanishes, from the unknowns and the state at the end. The base point of an autonomous system stays on
+        the section through the guess: Poincaré's phase condition."""
+        x = z[: len(last)]
+        gap = last - (x if self.symmetry is None else ravel(self.symmetry(unravel(x))))
+        return gap if section is None else jnp.append(gap, section.height(x))
 
-        return (flat, jnp.log(period)), on_section
 
-    def period(self, z: tuple, system: System) -> Scalar:
-        return jnp.exp(z[1]) if system.period is None else jnp.asarray(system.period, z[0].dtype) * self.order
+class _Section(NamedTuple):
+    """The plane through a guess, at right angles to the field there."""
+
+    guess: Array
+    normal: Array
+    period: Scalar  # that of the guess
+
+    @classmethod
+    def through(cls, system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any) -> "_Section":
+        model = SwitchedSystem.forwards(system, t0, y0)
+        return cls(ravel(y0), ravel(model.flow(t0, y0, at_start(model, t0, y0, mode))), period)
+
+    def height(self, x: Array) -> Scalar:
+        speed = self.normal @ self.normal
+        return self.normal @ (x - self.guess) / jnp.where(speed == 0, 1, speed)
+
+    def at_rest(self, x: Array, field: Array) -> Bool[Array, ""]:
+        """Whether the search was in an equilibrium, or ended in one: near it Newton's Jacobian is singular, and it
+        seldom says that it converged."""
+        slow = jnp.sqrt(self.normal @ self.normal) * self.period <= 1e-9 * (1 + jnp.max(jnp.abs(self.guess)))
+        return slow | (jnp.max(jnp.abs(field)) * self.period <= 1e-6 * (1 + jnp.max(jnp.abs(x))))
 
 
 @interactive
-def _shoot(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any) -> Orbit:
-    sign, integrator, tol = shooting.sign, shooting.integrator, shooting.newton.tol
-    autonomous = system.period is None
+def _searched(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any) -> Orbit:
+    """The search as one program."""
+    sign, integrator = shooting.sign, shooting.integrator
+    autonomous, section = system.period is None, None
     still, t_still = frozen((system, t0))
     guess, first_period = lax.stop_gradient((y0, period))
-    model = SwitchedSystem.forwards(still, t_still, guess)
-    normal = None
     if autonomous:
         base = base_point(still, t_still, guess, first_period, sign, mode, integrator)
         guess, first_period, mode = lax.stop_gradient(base)
-        normal = ravel(model.flow(t_still, guess, at_start(model, t_still, guess, mode)))
+        section = _Section.through(still, t_still, guess, first_period, mode)
     unravel = jfu.ravel_pytree(guess)[1]
-    unknown, residual = shooting.equations(guess, first_period, mode, normal)
-    # What depends on parameters does so by the second argument alone: the search needs no derivatives.
-    z, converged = find_root(residual, unknown, (system, t0), shooting.newton)
-    x, period = z[0], shooting.period(z, system)
 
+    def residual(z: Array, parameters: tuple) -> Array:
+        system, t0 = parameters
+        x = z[:-1] if autonomous else z
+        end = t0 + sign * shooting.part * shooting.period(x, z, system)
+        sol = integrate(system, t0, end, unravel(x), integrator, mode=mode)
+        return shooting.equations(z, _reached(sol), section, unravel)
+
+    # What depends on parameters does so by the second argument alone: the search needs no derivatives.
+    z, converged = find_root(
+        residual, shooting.unknowns(guess, first_period, autonomous), (system, t0), shooting.newton
+    )
+    x = z[:-1] if autonomous else z
+    period = shooting.period(x, z, system)
     shares = jnp.asarray(fractions(autonomous, shooting.order)[1], t0.dtype)
     saveat = dfx.SaveAt(ts=t0 + sign * period * shares, t1=True)
     sol = integrate(system, t0, t0 + sign * period, unravel(x), integrator, mode=mode, saveat=saveat)
-    points = jax.vmap(ravel)(sol.ys)
-    error = distance(points[-1], x)
-    size = 1 + jnp.max(jnp.abs(x))
+    later = jax.vmap(ravel)(sol.ys)[:-1]
+    monodromy = monodromy_by_arcs(system, sol, t0, unravel(x), integrator)
+    return _described(shooting, sol, unravel(x), period, (later, monodromy), section, mode, converged)
+
+
+class _Trial(NamedTuple):
+    """A solution from a state, and what can be made of it."""
+
+    base: tuple[Y, Scalar, Any]  # a better guess of state and period, and the modes of relays
+    step: tuple[Array, Bool[Array, ""], Bool[Array, ""]]  # Newton's
+    orbit: Orbit  # if it is closed
+
+
+def _search(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any) -> Orbit:
+    """The search, step by step."""
+    unsure, base = jnp.zeros((), bool), (y0, period, mode)
+
+    def look(z: Array, laps: float, converged: Any, **how: bool) -> _Trial:
+        return _tried(shooting, system, t0, base, z, jnp.asarray(laps, t0.dtype), converged, **how)
+
+    if system.period is None:
+        base = y0, period, (mode or {}) | (relays_at(system, t0, y0, mode) or {}) or None
+        base = look(shooting.unknowns(y0, period, True), LAPS, unsure).base
+    z, converged = shooting.unknowns(*base[:2], system.period is None), unsure
+    for _ in range(shooting.newton.max_iterations):
+        z, ended, converged = look(z, shooting.part, unsure).step
+        if ended:
+            break
+    orbit = look(z, 1.0, converged).orbit
+    if _based_on_event(orbit):  # beside it the flow's derivative is that of one side
+        orbit = look(z, 1.0, converged, by_arcs=True).orbit
+    return orbit
+
+
+def _based_on_event(orbit: Orbit) -> bool:
+    t, period = np.asarray(orbit.events.t)[: int(orbit.events.num)] - float(orbit.t0), float(orbit.period)
+    return bool(np.any(np.minimum(np.abs(t), np.abs(period - t)) <= AT_ONCE * period))
+
+
+@interactive
+def _tried(
+    shooting: Shooting,
+    system: System,
+    t0: Scalar,
+    base: tuple[Y, Scalar, Any],
+    z: Array,
+    laps: Scalar,
+    converged: Any,
+    *,
+    by_arcs: bool = False,
+) -> _Trial:
+    """The solution over so many periods, from the unknowns z; the guesses of state, period and modes, on which the
+    section stands. `by_arcs`: whether the monodromy matrix is that of the saltation formula, and not the derivative of
+    the flow."""
+    (guess, first, mode), sign, autonomous = base, shooting.sign, system.period is None
+    integrator = roomy(shooting.integrator) if autonomous else shooting.integrator
+    unravel = jfu.ravel_pytree(guess)[1]
+    x = z[:-1] if autonomous else z
+    period = shooting.period(x, z, system)
+    section = _Section.through(system, t0, guess, first, mode) if autonomous else None
+
+    def flow(x: Array, span: Scalar) -> tuple[Array, Solution]:
+        dense = dfx.SaveAt(dense=True)
+        sol = integrate(system, t0, t0 + span, unravel(x), integrator, mode=mode, saveat=dense, still=True)
+        return _reached(sol), sol
+
+    span = sign * laps * period
+    (monodromy, speed), sol = jax.jacfwd(flow, (0, 1), has_aux=True)(x, span)
+
+    def residual(z: Array) -> Array:
+        # The derivatives of the end are known.
+        x, change = (z[:-1], span * (z[-1] - lax.stop_gradient(z[-1]))) if autonomous else (z, 0)
+        last = _reached(sol) + monodromy @ (x - lax.stop_gradient(x)) + speed * change
+        return shooting.equations(z, last, section, unravel)
+
+    step = shooting.newton.step(z, residual(z), jax.jacfwd(residual)(z))
+    better = base_on(sol, t0, unravel(x), period, sign) if autonomous else base
+    shares = jnp.asarray(fractions(autonomous, shooting.order)[1], t0.dtype)
+    later = jax.vmap(lambda t: ravel(sol.evaluate(t)))(t0 + sign * period * shares)
+    one = sol.within(shooting.integrator.max_events)
+    monodromy = monodromy_by_arcs(system, one, t0, unravel(x), integrator) if by_arcs else monodromy
+    orbit = _described(shooting, one, unravel(x), period, (later, monodromy), section, mode, converged)
+    return _Trial(better, step, orbit)
+
+
+def _reached(sol: Solution) -> Array:
+    """The state at the end. A solution that ended early is no solution: Newton's method must not be led by it."""
+    return jnp.where(is_okay(sol.result), ravel(sol.y1), jnp.nan)
+
+
+def _described(
+    shooting: Shooting,
+    sol: Solution,
+    y0: Y,
+    period: Scalar,
+    along: tuple[Array, Array],
+    section: _Section | None,
+    mode: Any,
+    converged: Any,
+) -> Orbit:
+    """What is said of the orbit that is a solution over one period; `along` it are states at `fractions` of the period,
+    and at its end the monodromy matrix."""
+    system, t0, integrator, (later, monodromy) = sol.system, sol.t0, shooting.integrator, along
+    model, x, autonomous = SwitchedSystem.forwards(system, t0, y0), ravel(y0), system.period is None
+    error = distance(ravel(sol.y1), x)
     # A relay has a memory: its mode must come back with the state.
     closes = jnp.all(jnp.asarray([sol.mode0[k] == sol.mode1[k] for k in model.of_kind(relay)], bool))
-    good = converged & (error <= 1e3 * tol * size) & is_okay(sol.result) & closes
-    result = judge(good, x, points[:-1], autonomous, shooting.order)
-    if normal is not None:
-        # Where Newton's method ends near an equilibrium, its Jacobian is singular and it seldom says that it converged.
-        last = ravel(model.flow(t0, unravel(x), at_start(model, t0, unravel(x), mode)))
-        at_rest = jnp.sqrt(normal @ normal) * first_period <= 1e-9 * (1 + jnp.max(jnp.abs(unknown[0])))
-        at_rest |= jnp.max(jnp.abs(last)) * first_period <= 1e-6 * size
-        result = RESULTS.where(at_rest, RESULTS.orbit_is_equilibrium, result)
+    good = converged & (error <= 1e3 * shooting.newton.tol * (1 + jnp.max(jnp.abs(x)))) & is_okay(sol.result) & closes
+    result = judge(good, x, later, autonomous, shooting.order)
+    if section is not None:
+        field = ravel(model.flow(t0, y0, at_start(model, t0, y0, mode)))
+        result = RESULTS.where(section.at_rest(x, field), RESULTS.orbit_is_equilibrium, result)
     grazes = (sol.result == RESULTS.tangential_event) & (result == RESULTS.successful)
     result = RESULTS.where(grazes, RESULTS.tangential_event, result)
-
-    begin, stop, y, modes = arcs(sol, t0, unravel(x))
-    along, events = Arcs(begin, stop, modes, jax.tree.map(lambda y: y[:, None], y)), sol.events
+    begin, stop, y, modes = arcs(sol, t0, y0)
+    pieces, events = Arcs(begin, stop, modes, jax.tree.map(lambda y: y[:, None], y)), sol.events
     zeros = structural_zeros(system, modes)
-    monodromy = monodromy_by_arcs(system, sol, t0, unravel(x), integrator)
     found_out = floquet(monodromy[None], zeros, autonomous)
     if shooting.backward:
         found_out = forwards(found_out, zeros, autonomous)
-        along, events = _reversed(along, events, unravel(x), period)
+        pieces, events = _reversed(pieces, events, y0, period)
         zeros = jnp.zeros_like(zeros)
     monodromy, multipliers, stable = found_out
     return Orbit(
         system=system,
         t0=t0,
-        y0=unravel(x),
+        y0=y0,
         mode=sol.mode0,
         period=period,
         events=events,
@@ -136,7 +260,7 @@ def _shoot(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scalar
         admissible=jnp.ones((), bool),
         violation=jnp.zeros_like(t0),
         violation_t=t0,
-        arcs=along,
+        arcs=pieces,
         result=result,
         integrator=integrator,
     )

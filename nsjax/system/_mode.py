@@ -1,5 +1,6 @@
 """The mode of a system: one small integer for each switch."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -36,6 +37,13 @@ class ModeState(NamedTuple):
 
 def pick(values: tuple[Any, ...], index: Any) -> Any:
     """One of several, by an index that may be traced, or None if there is but one."""
-    if index is None or len(values) == 1:
-        return values[0]
-    return jnp.stack(values)[index]
+    found = values[0]
+    for i, value in enumerate(values[1:], 1):
+        found = jnp.where(index == i, value, found)
+    return found
+
+
+def put(values: tuple[Any, ...], which: Sequence[int], new: Sequence[Any]) -> tuple[Any, ...]:
+    """The same values, with others in some places."""
+    found = dict(zip(which, new))
+    return tuple(found.get(i, v) for i, v in enumerate(values))

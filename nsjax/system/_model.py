@@ -15,15 +15,15 @@ import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._autodiff import frozen
-from .._numerics._jaxpr import dependence, is_affine, is_constant
-from .._numerics._linalg import linear_solve, parallel
+from .._numerics._jaxpr import dependence, is_affine, is_constant, touched
+from .._numerics._linalg import parallel, Row, row, solve_rows
 from .._types import Scalar, Y
 from ._clocked import Clocked
-from ._mode import BEYOND, ModeState, pick, Slot
+from ._linearisation import Linearisation, linearise
+from ._mode import BEYOND, ModeState, pick, put, Slot
 from ._parameter import Path, put_parameter
 from ._system import System
 
@@ -35,7 +35,10 @@ class SwitchedSystem(Clocked):
     parts: tuple[int, ...] = eqx.field(static=True)  # number of components of h, per switch
     holdable: tuple[int, ...] = eqx.field(static=True)  # switches whose value can hold the solution on their surface
     contacts: tuple[int, ...] = eqx.field(static=True)  # the impacts among them
-    jointly_affine: bool = eqx.field(static=True)
+    acts: tuple[tuple[bool, ...], ...] = eqx.field(
+        static=True
+    )  # the value of each of them on which leaves of the state
+    jointly_affine: bool = eqx.field(static=True)  # whether the field is so in the values of all of them
     steady: bool = eqx.field(static=True)  # whether what acts on a surface that can be slid on is constant
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # of `holdable`: whose surfaces may coincide
     slots: tuple[Slot, ...] = eqx.field(static=True)
@@ -64,7 +67,15 @@ class SwitchedSystem(Clocked):
 
         self.holdable = tuple(k for k in range(len(self.switches)) if holds(k))
         self.contacts = tuple(k for k in self.holdable if self.switches[k].order == 2)
-        self.jointly_affine = is_affine(lambda s: self.field(t, y, s), zeros)
+
+        def pulled(values: tuple) -> list[Any]:
+            return jax.tree.leaves(self.field(t, y, put(zeros, self.holdable, values)))
+
+        nought = tuple(zeros[k] for k in self.holdable)
+        self.acts = tuple(
+            tuple(touched(lambda v, i=i: pulled(put(nought, (i,), (v,))), v)) for i, v in enumerate(nought)
+        )
+        self.jointly_affine = is_affine(pulled, nought)
         dry = [k for k in self.holdable if k not in self.contacts]
 
         def effects(args: tuple[Scalar, Y, tuple]) -> list[Any]:
@@ -182,30 +193,35 @@ class SwitchedSystem(Clocked):
         """Switch values of a mode, with 0 for those which are held, and for contacts."""
         return tuple(switch.value(m, t.dtype) for switch, m in zip(self.switches, state.mode))
 
-    def linear(self, t: Scalar, y: Y, state: ModeState, s: tuple) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
-        """Rates of the holdable surfaces at `s`, and their derivatives with respect to the holdable values."""
+    def linearised(self, t: Scalar, y: Y, state: ModeState, s: tuple) -> Linearisation:
+        """The field and the rates of the holdable surfaces at `s`, and how they change with the holdable values."""
         self = self._in(state)
-        which = self.holdable
+        tree = jax.tree.structure(y)
 
-        def rates(sigma: Float[Array, " m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-            full = list(s)
-            for i, k in enumerate(which):
-                full[k] = sigma[i]
-            out = jnp.stack(self.rates(which, t, y, state, tuple(full)))
-            return out, out
+        def field(*values: Scalar) -> list[Any]:
+            return jax.tree.leaves(self.field(t, y, put(s, self.holdable, values)))
 
-        slope, now = jax.jacfwd(rates, has_aux=True)(jnp.stack([s[k] for k in which]))
-        if self.contacts and len(which) > 1:
+        def levels(t: Scalar, *leaves: Any) -> list[Scalar]:
+            return [self.level(k, t, jax.tree.unflatten(tree, leaves), state) for k in self.holdable]
+
+        near = linearise(field, tuple(s[k] for k in self.holdable), levels, t, y, self.acts)
+        if self.contacts and len(self.holdable) > 1:
             # Friction along a contact that holds already is free, and so is that of a contact without force: a trace of
             # compliance gives it the value 0.
-            dry = jnp.asarray([k not in self.contacts for k in which])
-            total, least = jnp.sum(jnp.abs(slope), axis=1), jnp.sqrt(jnp.finfo(t.dtype).tiny)
-            slope -= jnp.diag(jnp.where(dry, jnp.where(total == 0, least, 4 * jnp.finfo(t.dtype).eps * total), 0))
-        return now, slope
+            least = jnp.sqrt(jnp.finfo(t.dtype).tiny)
+            for i in [i for i, k in enumerate(self.holdable) if k not in self.contacts]:
+                total = sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(near.slope[i]))
+                trace = jnp.where(total == 0, least, 4 * jnp.finfo(t.dtype).eps * total)
+                own = row([trace if i == j else jnp.zeros_like(trace) for j in range(len(self.holdable))])
+                near.slope[i] = jax.tree.map(jnp.subtract, near.slope[i], own)
+        return near
 
-    def multipliers(
-        self, slope: Float[Array, "m m"], right: Float[Array, " m"], held: Bool[Array, " m"]
-    ) -> Float[Array, " m"]:
+    def linear(self, t: Scalar, y: Y, state: ModeState, s: tuple) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
+        """Rates of the holdable surfaces at `s`, and their derivatives with respect to the holdable values."""
+        near = self.linearised(t, y, state, s)
+        return jnp.asarray(near.rates), jnp.stack([jnp.asarray(rates) for rates in near.slope])
+
+    def multipliers(self, slope: list[Any], right: Row, held: Any) -> Any:
         """σ with slope σ = right over the holdable switches that are `held`, and 0 for the others.
 
         Where surfaces coincide (friction elements on one velocity) slope is singular: it determines only the sum of
@@ -213,63 +229,55 @@ class SwitchedSystem(Clocked):
         that yield at the same deflection. No other split holds for longer: all of them reach their bounds together,
         each in the direction in which it resists, and so when the sum of their strengths is spent.
         """
-        m, dtype = len(held), slope.dtype
-        matrix = jnp.where(held[:, None] & held[None, :], slope, jnp.eye(m, dtype=dtype))
-        right = jnp.where(held, right, 0)
-        rows = matrix
+        m, zero, one = len(slope), jnp.zeros_like(right[0]), jnp.ones_like(right[0])
+        # A vanishing slope off the surface is no fault; on it the quotient is infinite, and so is found.
+        units = [row([one if i == j else zero for j in range(m)]) for i in range(m)]
+        rows = [
+            jax.tree.map(lambda x, h, u, i=i: jnp.where(held[i] & h, x, u), slope[i], held, units[i]) for i in range(m)
+        ]
+        right, matrix = jax.tree.map(lambda r, h: jnp.where(h, r, 0), right, held), list(rows)
         for i, j in self.pairs:
             same = held[i] & held[j] & parallel(rows[i], rows[j])
             # In which direction each of them pushes the surface is told by the row, and each of the two rows will do.
-            weights: list[Any] = [0.0] * m
-            weights[i], weights[j] = self.bound(self.holdable[j]), -self.bound(self.holdable[i])
-            share = jnp.where(rows[i] < 0, -1.0, 1.0) * jnp.stack([jnp.asarray(w, dtype) for w in weights])
-            instead = same & (np.arange(m) == j)
-            matrix, right = jnp.where(instead[:, None], share, matrix), jnp.where(instead, 0, right)
-        return linear_solve(matrix, right)
+            bounds = {i: self.bound(self.holdable[j]), j: -self.bound(self.holdable[i])}
+            weights = row([jnp.asarray(bounds.get(n, zero), zero.dtype) for n in range(m)])
+            share = jax.tree.map(lambda x, w: jnp.where(x < 0, -w, w), rows[i], weights)
+            matrix[j] = jax.tree.map(lambda a, b, same=same: jnp.where(same, a, b), share, matrix[j])
+            one_of = row([same if n == j else jnp.zeros_like(same) for n in range(m)])
+            right = jax.tree.map(lambda r, gone: jnp.where(gone, 0, r), right, one_of)
+        return solve_rows(matrix, right)
+
+    def _resolved(self, t: Scalar, y: Y, state: ModeState) -> tuple[tuple[Any, ...], Y]:
+        """The value of every switch in a mode, and the field for them."""
+        self = self._in(state)
+        s, which = self.signs(t, state), self.holdable
+        if not which:
+            return s, self.field(t, y, s)
+        held = row([self.held(k, state.mode[k]) for k in which])
+
+        def moves(s: tuple) -> tuple[Row, Linearisation]:
+            near = self.linearised(t, y, state, s)
+            return self.multipliers(near.slope, jax.tree.map(jnp.negative, near.rates), held), near
+
+        def after(s: tuple, move: Row) -> tuple:
+            return put(s, which, [s[k] + d for k, d in zip(which, move)])
+
+        if self.jointly_affine:
+            move, near = moves(s)
+            return after(s, move), near.pulled(near.field, move)
+        # Newton's method for a multi-affine field. Friction proportional to a contact force has no say where that is
+        # zero: the search sets out from another value.
+        begin = [jnp.where(h, 1, s[k]) if k in self.contacts else s[k] for k, h in zip(which, held)]
+        s = lax.fori_loop(0, 6, lambda _, s: after(s, moves(s)[0]), put(s, which, begin))
+        return s, self.field(t, y, s)
 
     def values(self, t: Scalar, y: Y, state: ModeState) -> tuple[Any, ...]:
         """The value of every switch in a mode: signs, and the multipliers λ of those that are held, (2.20)."""
-        self = self._in(state)
-        s = self.signs(t, state)
-        which = self.holdable
-        if not which:
-            return s
-        if len(which) == 1:
-            (k,) = which
-
-            def rate(sk: Scalar) -> Scalar:
-                return self.rates(which, t, y, state, s[:k] + (sk,) + s[k + 1 :])[0]
-
-            zero = jnp.zeros((), t.dtype)
-            r, slope = jax.jvp(rate, (zero,), (jnp.ones_like(zero),))
-            held = self.held(k, state.mode[k])
-            # A vanishing slope off the surface is no fault; on it the quotient is infinite, and so is found.
-            lam = -r / jnp.where(held, slope, 1)
-            return s[:k] + (jnp.where(held, lam, s[k]),) + s[k + 1 :]
-        held = jnp.stack([self.held(k, state.mode[k]) for k in which])
-
-        def put(sigma: Float[Array, " m"]) -> tuple[Any, ...]:
-            full = list(s)
-            for i, k in enumerate(which):
-                full[k] = sigma[i]
-            return tuple(full)
-
-        def newton(_: Any, sigma: Float[Array, " m"]) -> Float[Array, " m"]:
-            r, slope = self.linear(t, y, state, put(sigma))
-            return sigma + self.multipliers(slope, -r, held)
-
-        sigma = jnp.stack([s[k] for k in which])
-        if self.jointly_affine:
-            return put(newton(0, sigma))
-        # Newton's method for a multi-affine field. Friction proportional to a contact force has no say where that is
-        # zero: the search sets out from another value.
-        force = jnp.asarray([k in self.contacts for k in which])
-        return put(lax.fori_loop(0, 6, newton, jnp.where(held & force, 1, sigma)))
+        return self._resolved(t, y, state)[0] if self.holdable else self.signs(t, state)
 
     def flow(self, t: Scalar, y: Y, state: ModeState) -> Y:
         """The right-hand side in a mode; for a sliding one it is Filippov's field (2.19)."""
-        self = self._in(state)
-        return self.field(t, y, self.values(t, y, state))
+        return self._resolved(t, y, state)[1]
 
     def force(self, t: Scalar, y: Y, state: ModeState) -> Scalar:
         """The largest component of the terms that make up the field: with it those which cancel where it is held."""
@@ -294,23 +302,21 @@ class SwitchedSystem(Clocked):
         if not which:
             return y
         self = self._in(state)
-        s = self.values(t, y, state)
-        held = jnp.stack([self.held(k, state.mode[k]) for k in which])
-        _, slope = self.linear(t, y, state, s)
+        s = self.signs(t, state) if self.jointly_affine and not self.contacts else self.values(t, y, state)
+        held = row([self.held(k, state.mode[k]) for k in which])
+        near = self.linearised(t, y, state, s)
 
-        def push(y: Y, gaps: list[Scalar]) -> Y:
-            """∂f/∂s times the values which close the gaps."""
-            move = self.multipliers(slope, -jnp.stack(gaps), held)
-            ds = [jnp.zeros_like(v) for v in s]
-            for i, k in enumerate(which):
-                ds[k] = jnp.where(held[i], move[i], 0)
-            return jax.jvp(lambda s: self.field(t, y, s), (s,), (tuple(ds),))[1]
+        def closing(gaps: list[Scalar]) -> Row:
+            """The values which close the gaps."""
+            found = self.multipliers(near.slope, row([-g for g in gaps]), held)
+            return jax.tree.map(lambda h, d: jnp.where(h, d, 0), held, found)
 
         if self.contacts:
             gaps = [self.h(k, t, y)[0] if k in self.contacts else jnp.zeros_like(t) for k in which]
-            dq = jax.jvp(lambda y: self.field(t, y, s), (y,), (push(y, gaps),))[1]
+            push = near.pulled(jax.tree.map(jnp.zeros_like, y), closing(gaps))
+            dq = jax.jvp(lambda y: self.field(t, y, s), (y,), (push,))[1]
             y = jax.tree.map(jnp.add, y, dq)
-        return jax.tree.map(jnp.add, y, push(y, [self.level(k, t, y, state) for k in which]))
+        return near.pulled(y, closing([self.level(k, t, y, state) for k in which]))
 
     # Guards: positive while the mode lasts. Slot i is the maximum over the last axis, so that the event is the
     # instant at which all of its entries have become non-positive.

@@ -1,5 +1,6 @@
 """What an event does to the state and the mode."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -46,11 +47,12 @@ def transition(
     model: SwitchedSystem,
     stepper: Stepper,
     tolerance: tuple[Any, Any],
-    want_points: bool,
+    record: Callable[[Any], Any] | None,
     begin: Scalar,
     step: Interval,
 ) -> Transition:
-    """Locates the earliest event of a step, of a solution that sets out at time `begin`, and makes the transition."""
+    """Locates the earliest event of a step, of a solution that sets out at time `begin`, and makes the transition.
+    `record`: what dense output is made of, if any; it may be without derivatives."""
     event = _Event(model, begin, step, locate(model, stepper, step))
     event.fire()
     event.jump()
@@ -82,10 +84,10 @@ def transition(
     bends = bend(rows, (t - step.t) / jnp.where(halted, 1, step.t_next - step.t)) > 0
     grazes = event.found & news & ~halted & bends & (cosine < jnp.cbrt(jnp.finfo(t.dtype).eps))
     points = None
-    if want_points:
+    if record is not None:
         # Once more, to the very event and with the derivatives of where it begins and ends.
-        _, increments = step_to(t, stepper, (model, step.t, step.y, step.f, step.state))
-        points = stack(stepper.points(step.y, event.before, increments))
+        at, within, before = record((t, (model, step.t, step.y, step.f, step.state), event.before))
+        points = stack(stepper.points(within[2], before, step_to(at, stepper, within)[1]))
     return Transition(
         found=event.found,
         t=t,

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._numerics._bernstein import binomials
+from ..._numerics._linalg import row
 from ..._numerics._series import Coefficient, Series
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
@@ -176,10 +177,10 @@ class TaylorStepper(Stepper):
         s = model.values(t, y, state)
         inverse = None
         if which:
-            held = jnp.stack([model.held(k, state.mode[k]) for k in which])
-            _, slope = model.linear(t, y, state, s)
-            eye = jnp.eye(len(which), dtype=t.dtype)
-            inverse = jax.vmap(model.multipliers, in_axes=(None, 0, None), out_axes=1)(slope, eye, held)
+            held = row([model.held(k, state.mode[k]) for k in which])
+            slope, units = model.linearised(t, y, state, s).slope, row(jnp.eye(len(which), dtype=t.dtype))
+            inverse = jnp.stack(list(jax.vmap(model.multipliers, in_axes=(None, 0, None))(slope, units, held)))
+            inverse = inverse if isinstance(units, list) else inverse.T
 
         def fn(t: Scalar, *args: Array) -> list[Array]:
             y, s = jax.tree.unflatten(tree, args[: len(leaves)]), self.values(model, state, t, args[len(leaves) :])
@@ -213,8 +214,8 @@ class TaylorStepper(Stepper):
         resolved = jnp.ones((), bool)
         if watch is not None and not all(watch.affine):
             # A kink within the step is seen at its end.
-            for row, ends, affine in zip(guards, model.guards(t_next, y1, state), watch.affine):
-                for c, end in zip(row, () if affine else ends):
+            for parts, ends, affine in zip(guards, model.guards(t_next, y1, state), watch.affine):
+                for c, end in zip(parts, () if affine else ends):
                     resolved = resolved & (jnp.abs(sum(c[::-1]) - end) <= unresolved(t.dtype) * _size(c))
         last = jax.tree.map(lambda f: (t_next - t) * f, slope)
         return Step(t_next, y1, _error(ks, last), ks, slope, guards, with_multipliers(model, noise), resolved)

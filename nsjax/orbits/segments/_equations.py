@@ -172,22 +172,26 @@ class OrbitCurve(eqx.Module):
 def guard_sizes(curve: OrbitCurve, start: Start) -> np.ndarray:
     """What a unit of the unknowns makes of each guard: from their gradients at the beginnings of the segments."""
 
-    @jax.jit
-    def sizes(t: Scalar, x: Array, mode: Array, part: Array) -> Array:
-        state = curve.state(mode, part)
-        by_t, by_x = jax.jacfwd(lambda t, x: curve.guards(curve.model, t, x, state), argnums=(0, 1))(t, x)
-        both = jnp.concatenate([by_t[..., None] * curve.time, by_x * curve.sizes], axis=-1)
-        return jnp.max(jnp.where(jnp.isfinite(both), jnp.abs(both), 0), axis=(-2, -1))
-
     if not curve.model.slots:
         return np.zeros(0)
     rows = start.itinerary.rows
-    seen = [sizes(start.begin[i], start.x[i], start.itinerary.mode[i], start.itinerary.part[i]) for i in rows]
+    seen = [
+        _gradients(curve, start.begin[i], start.x[i], start.itinerary.mode[i], start.itinerary.part[i]) for i in rows
+    ]
     # Those of a switch that is held are seen in that mode alone.
     every = np.stack([np.ones(len(curve.model.switches), np.int32) * m for m in (-1, 0, 1)])
-    seen += [sizes(start.begin[0], start.x[0], mode, start.itinerary.part[0]) for mode in every]
+    seen += [_gradients(curve, start.begin[0], start.x[0], mode, start.itinerary.part[0]) for mode in every]
     found = np.max(np.abs(np.asarray(seen)), axis=0)
     return np.where(np.isfinite(found) & (found > 0), found, 1.0)
+
+
+@interactive
+def _gradients(curve: OrbitCurve, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
+    """The largest component of the gradient of each guard, by the unknowns."""
+    state = curve.state(mode, part)
+    by_t, by_x = jax.jacfwd(lambda t, x: curve.guards(curve.model, t, x, state), argnums=(0, 1))(t, x)
+    both = jnp.concatenate([by_t[..., None] * curve.time, by_x * curve.sizes], axis=-1)
+    return jnp.max(jnp.where(jnp.isfinite(both), jnp.abs(both), 0), axis=(-2, -1))
 
 
 def row_sizes(df: Array) -> Array:

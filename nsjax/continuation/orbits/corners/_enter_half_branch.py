@@ -98,11 +98,8 @@ def _predicted(curve: OrbitCurve, spot: OrbitPoint, points: list[Base], cycle: C
     begin = np.array([points[i % m].t for i in range(count)])
     end = np.array([points[(i + 1) % m].t + (period if (i + 1) % m == 0 else 0) for i in range(count)])
     modes = np.stack([points[i % m].mode for i in range(count)]).astype(np.int32)
-    lanes = _filled(x, np.full(count, value), begin, end, modes)
-    xs, values, begins, stops, held = lanes
-    reference = np.asarray(spot.look.parameter)
-    _, _, events, good = jax.device_get(follow(curve, xs, values, reference, begins, stops, held))
-    if not np.all(good[:count]):
+    _, _, events, good = follow(curve, x, np.full(count, value), spot.look.parameter, begin, end, modes)
+    if not np.all(good):
         return None
     here, there = (curve.model.with_parameter(curve.path, jnp.asarray(v)).system for v in (spot.parameter, value))
     slow = 1.0 if curve.autonomous else float(there.period) / float(here.period)
@@ -115,9 +112,3 @@ def _predicted(curve: OrbitCurve, spot: OrbitPoint, points: list[Base], cycle: C
     if curve.autonomous and len(diary.t):  # time counts from the first event, as on the curve
         diary = diary._replace(t=diary.t - diary.t[0])
     return starts_from(curve.model, curve.like, [there], [diary], [at])[0]
-
-
-def _filled(*columns: np.ndarray) -> list[np.ndarray]:
-    """So many lanes that few programs are compiled."""
-    lanes = 16 * -(-len(columns[0]) // 16)
-    return [np.concatenate([c, np.repeat(c[-1:], lanes - len(c), axis=0)]) for c in columns]

@@ -57,30 +57,35 @@ class ReturnMap(NamedTuple):
     jumps: bool
 
 
+def follow(curve: OrbitCurve, xs: Any, values: Any, reference: Any, begin: Any, end: Any, modes: Any) -> tuple:
+    """Pieces of laps: the states at their ends, the derivatives of these by state and parameter, the events, and
+    whether all went well; one after the other, as programs for batches are larger. Times are those of the phases of the
+    forcing for the value `reference` of the parameter."""
+    lanes = [map(np.asarray, lane) for lane in zip(xs, values, begin, end, modes)]
+    found = [jax.device_get(_followed(curve, np.asarray(reference), *lane)) for lane in lanes]
+    return jax.tree.map(lambda *rows: np.stack(rows), *found)
+
+
 @interactive
-def follow(
-    curve: OrbitCurve, xs: Any, values: Any, reference: Any, begin: Any, end: Any, modes: Any
+def _followed(
+    curve: OrbitCurve, reference: Any, x: Any, value: Any, a: Any, b: Any, mode: Any
 ) -> tuple[jax.Array, jax.Array, Events, jax.Array]:
-    """Pieces of laps, with derivatives by state and parameter: lanes over the leading axis. Times are those of the
-    phases of the forcing for the value `reference` of the parameter."""
+    """One piece."""
 
-    def one(x: Any, value: Any, a: Any, b: Any, mode: Any) -> tuple:
-        def flow(z: jax.Array) -> tuple:
-            system = put_parameter(curve.model.system, curve.path, z[-1])
-            slow = jnp.ones_like(a)
-            if not curve.autonomous:
-                still = put_parameter(curve.model.system, curve.path, reference)
-                slow = jnp.asarray(system.period, a.dtype) / jnp.asarray(still.period, a.dtype)
-            given = tuple(mode) if curve.model.switches else None
-            integrator = curve.integrator._replace(max_events=MAX_EVENTS)
-            sol = integrate(system, a * slow, b * slow, curve.unravel(z[:-1]), integrator, mode=given)
-            end = jfu.ravel_pytree(sol.y1)[0]
-            return end, (end, sol.events, is_okay(sol.result))
+    def flow(z: jax.Array) -> tuple:
+        system = put_parameter(curve.model.system, curve.path, z[-1])
+        slow = jnp.ones_like(a)
+        if not curve.autonomous:
+            still = put_parameter(curve.model.system, curve.path, reference)
+            slow = jnp.asarray(system.period, a.dtype) / jnp.asarray(still.period, a.dtype)
+        given = tuple(mode) if curve.model.switches else None
+        integrator = curve.integrator._replace(max_events=MAX_EVENTS)
+        sol = integrate(system, a * slow, b * slow, curve.unravel(z[:-1]), integrator, mode=given, still=True)
+        end = jfu.ravel_pytree(sol.y1)[0]
+        return end, (end, sol.events, is_okay(sol.result))
 
-        jacobian, (end, events, good) = jax.jacfwd(flow, has_aux=True)(jnp.append(x, value))
-        return end, jacobian, events, good
-
-    return jax.vmap(one)(xs, values, begin, end, modes)
+    jacobian, (end, events, good) = jax.jacfwd(flow, has_aux=True)(jnp.append(x, value))
+    return end, jacobian, events, good
 
 
 def bases(curve: OrbitCurve, spot: Any, touches: list[Touch]) -> list[Base]:
@@ -177,16 +182,14 @@ def _piece(curve: OrbitCurve, spot: Any, points: list[Base], p: int) -> Any:
             z = np.append(base.x, float(spot.look.parameter))
             z = z + np.concatenate([np.outer(roots**2, d), -np.outer(roots**2, d)]) * sizes
             lanes = 2 * LEVELS
-            ends, jacobians, events, good = jax.device_get(
-                follow(
-                    curve,
-                    z[:, :-1],
-                    z[:, -1],
-                    spot.look.parameter,
-                    np.full(lanes, base.t),
-                    np.full(lanes, end),
-                    np.tile(base.mode.astype(np.int32), (lanes, 1)),
-                )  # fmt: skip
+            ends, jacobians, events, good = follow(
+                curve,
+                z[:, :-1],
+                z[:, -1],
+                spot.look.parameter,
+                np.full(lanes, base.t),
+                np.full(lanes, end),
+                np.tile(base.mode.astype(np.int32), (lanes, 1)),
             )
             keys = [_key(events, lane) for lane in range(lanes)]
             one, other = keys[:LEVELS], keys[LEVELS:]

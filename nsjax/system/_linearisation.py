@@ -1,0 +1,71 @@
+"""How the field of a mode, and the rates at which it moves along surfaces, change with the values of switches."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from .._numerics._linalg import Row, row, WRITTEN_OUT
+from .._types import Scalar, Y
+
+
+class Linearisation(NamedTuple):
+    """The field for given switch values, and what changes with those that can hold the solution on a surface."""
+
+    field: Y
+    pulls: list[Any]  # `[leaf]`: the derivatives of the field by each value, a row; None where it does not act
+    rates: Row  # of `SwitchedSystem.level`, for each surface that can be slid on
+    slope: list[Any]  # of each its derivatives by the values, a row
+
+    def pulled(self, tree: Y, by: Row) -> Y:
+        """`tree` moved by so much along each of the derivatives. Of the field that is the one for values which differ
+        by so much, if it is affine in them."""
+        leaves, structure = jax.tree.flatten(tree)
+
+        def moved(x: Any, pull: Any) -> Any:
+            if isinstance(pull, list):
+                return sum((d * p for d, p in zip(by, pull) if p is not None), x)
+            return x + jnp.tensordot(by, pull, 1)
+
+        return jax.tree.unflatten(structure, [moved(x, pull) for x, pull in zip(leaves, self.pulls)])
+
+
+def linearise(
+    field: Callable[..., list[Any]],
+    values: tuple[Scalar, ...],
+    levels: Callable[..., list[Scalar]],
+    t: Scalar,
+    y: Y,
+    acts: tuple[tuple[bool, ...], ...],
+) -> Linearisation:
+    """Of `field(*values)`, the leaves of y', and `levels(t, *leaves)`; each value acts on the leaves that `acts` tells.
+
+    The derivatives by few values are worked out one by one, so that what is zero is left out; by many as a batch.
+    """
+    leaves, tree = jax.tree.flatten(y)
+    if len(values) > WRITTEN_OUT:
+        at, pulls = jax.vmap(lambda *d: jax.jvp(field, values, d), out_axes=(None, 0))(
+            *jnp.eye(len(values), dtype=t.dtype)
+        )
+        still = jnp.zeros_like(t)
+        slope = jax.vmap(lambda *pull: jax.jvp(levels, (t, *leaves), (still, *pull))[1])(*pulls)
+    else:
+        at, columns, slopes = leaves, [], []
+        for j, moves in enumerate(acts):
+
+            def by_one(value: Scalar, j: int = j) -> list[Any]:
+                return field(*values[:j], value, *values[j + 1 :])
+
+            at, pull = jax.jvp(by_one, (values[j],), (jnp.ones_like(values[j]),))
+            columns.append([p if moved else None for p, moved in zip(pull, moves)])
+            moved = [i for i, moved in enumerate(moves) if moved]
+
+            def of_moved(*xs: Any, moved: list[int] = moved) -> list[Scalar]:
+                full = dict(zip(moved, xs))
+                return levels(t, *[full.get(i, leaf) for i, leaf in enumerate(leaves)])
+
+            slopes.append(jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(pull[i] for i in moved))[1])
+        pulls, slope = ([list(column) for column in zip(*table)] for table in (columns, slopes))
+    rates = jax.jvp(levels, (t, *leaves), (jnp.ones_like(t), *at))[1]
+    return Linearisation(jax.tree.unflatten(tree, at), pulls, row(rates), slope)
