@@ -5,10 +5,13 @@ import jax
 import jax.numpy as jnp
 import pytest
 from models import Motion
-from programs import count
+from programs import count, equations_of
 
 import nsjax
 from nsjax import solve
+from nsjax.flow._integrator import Integrator
+from nsjax.flow._solve import _flow, _Options
+from nsjax.flow.steppers._stepper import RungeKutta
 from nsjax.system._model import SwitchedSystem
 
 
@@ -139,3 +142,60 @@ def test_affine_surfaces_are_not_interpolated():
 def test_dense_output_costs_only_where_asked_for(free):
     assert total(primitives(Free(), saveat=dfx.SaveAt(dense=True))) > total(free)
     assert total(primitives(Free(), saveat=dfx.SaveAt(t0=True, t1=True))) < 1.2 * total(free)
+
+
+class Sliders(nsjax.System):
+    """Blocks that rub, each on a belt of its own."""
+
+    number: int
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - jnp.stack([getattr(s, k.name) for k in self.switches]))
+
+    @property
+    def switches(self):
+        return tuple(nsjax.sgn(lambda _, t, y, i=i: y.v[i] - 0.1 * i, name=f"rub{i}") for i in range(self.number))
+
+
+def test_each_switch_adds_and_does_not_multiply():
+    """Equations against the number of switches that can hold: from five to six no more than a quarter is added."""
+    heun = dict(solver=dfx.Heun(), stepsize_controller=dfx.ConstantStepSize(), dt0=0.1, throw=False)
+
+    def equations(n):
+        y = Motion(jnp.ones(n), jnp.ones(n))
+        flow = jax.make_jaxpr(lambda y: solve(Sliders(n), 0.0, 1.0, y, **heun).y1)(y)
+        return total(count(flow.jaxpr))
+
+    counts = [equations(n) for n in (1, 2, 5, 6)]
+    print(counts)
+    assert counts[1] < 2 * counts[0] and counts[3] < 1.5 * counts[2]
+
+
+def test_multipliers_are_not_taken_to_jump():
+    """Comparisons in the linear system for several multipliers are none of the model's: nothing looks for a jump in
+    time, which took a quarter of such a program."""
+    t, y = jnp.zeros(()), Motion(jnp.ones(2), jnp.ones(2))
+    options = _Options({}, Integrator(dfx.Heun(), None).checked(t.dtype), dfx.SaveAt(t1=True))
+
+    def jumpy(system, y):
+        model = SwitchedSystem.forwards(system, t, y)
+        state = model.state_at(t, y, tuple(jnp.ones((), jnp.int32) for _ in model.switches))
+        return _flow(model, RungeKutta(dfx.Heun()), (t, t + 1), y, state, options).jumpy
+
+    class Sawtooth(Rubbing):
+        def vector_field(self, t, y, s):
+            return Motion(y.v, -y.x - s.rub + t - jnp.floor(t))
+
+    assert not any(jumpy(Sliders(2), y))
+    assert jumpy(Sawtooth(), Motion(jnp.ones(()), jnp.ones(()))) == (False, True, True)
+
+
+def test_the_loop_is_not_taken_for_a_count():
+    """Where its condition depends on one number alone XLA looks for a count of the turns in the whole program, which took
+    a quarter of the compilation."""
+    flow = jax.make_jaxpr(lambda y: solve(Rubbing(), 0.0, 1.0, y, throw=False).y1)(Motion(jnp.ones(()), jnp.ones(())))
+    loops = [e for e in equations_of(flow.jaxpr) if e.primitive.name == "while"]
+    outermost = max(loops, key=lambda e: total(count(e.params["body_jaxpr"].jaxpr)))
+    condition = outermost.params["cond_jaxpr"].jaxpr
+    used = {v for e in condition.eqns for v in e.invars if v in condition.invars}
+    assert len(used) > 1

@@ -4,6 +4,7 @@ import gc
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 import numpy as np
 import pytest
 
@@ -32,6 +33,28 @@ def test_the_same_within_other_programs():
     count = len(traced)
     fn(x + 1, 2)
     assert len(traced) == count  # compiled once
+
+
+def test_options_are_given_to_the_outermost_program_only(monkeypatch):
+    """Whatever else is in the way: the compiler gets them where the function is called directly, and not elsewhere."""
+    given, jit = [], _compile.eqx.filter_jit
+
+    def spied(fn, **options):
+        compiled = jit(fn, **options)
+
+        def call(*args):
+            given.append(options)
+            return compiled(*args)
+
+        return call
+
+    monkeypatch.setattr(_compile.eqx, "filter_jit", spied)
+    fn = interactive(lambda x: jnp.cos(x))
+    np.testing.assert_allclose(fn(jnp.ones(())), np.cos(1))
+    np.testing.assert_allclose(jax.jit(fn)(jnp.ones(())), np.cos(1))
+    assert given == [{"compiler_options": _compile._options()}, {}]
+    if jaxlib.__version__.startswith("0.10."):
+        assert _compile._options() == _compile.QUICK
 
 
 def test_collection_is_restored():

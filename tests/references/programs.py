@@ -6,14 +6,15 @@ import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
 
-def count(jaxpr, into=None):
-    """How often each primitive occurs, in all nested jaxprs too."""
-    into = collections.Counter() if into is None else into
+def equations_of(jaxpr):
+    """All of them, those of nested jaxprs too."""
     for eqn in jaxpr.eqns:
-        into[eqn.primitive.name] += 1
+        yield eqn
         for value in jax.tree.leaves(eqn.params, is_leaf=lambda x: isinstance(x, (Jaxpr, ClosedJaxpr))):
-            if isinstance(value, ClosedJaxpr):
-                count(value.jaxpr, into)
-            elif isinstance(value, Jaxpr):
-                count(value, into)
-    return into
+            if isinstance(value, (Jaxpr, ClosedJaxpr)):
+                yield from equations_of(getattr(value, "jaxpr", value))
+
+
+def count(jaxpr):
+    """How often each primitive occurs."""
+    return collections.Counter(eqn.primitive.name for eqn in equations_of(jaxpr))
