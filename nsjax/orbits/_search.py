@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from .._numerics._autodiff import frozen
+from .._numerics._compile import interactive
 from .._numerics._root import Newton
 from .._types import Scalar, Y
 from ..flow._integrator import Integrator
@@ -134,7 +136,8 @@ class Search(NamedTuple):
         return eqx.tree_at(lambda o: o.result, orbit, result)
 
 
-def _neutral(orbit: Orbit) -> bool:
+@interactive
+def _neutral(orbit: Orbit) -> Bool[Array, ""]:
     """Whether friction holds a forced orbit for all of its period, and lets others beside it repeat themselves too."""
     held = held_throughout(orbit.system, orbit.arcs.begin, orbit.arcs.end, orbit.arcs.mode)
-    return bool(held & jnp.any(jnp.abs(orbit.multipliers - 1) <= 1e-6))
+    return held & jnp.any(jnp.abs(orbit.multipliers - 1) <= 1e-6)

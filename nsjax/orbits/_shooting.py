@@ -53,10 +53,6 @@ class Shooting(NamedTuple):
         """From the unknowns z, which begin with the state x."""
         return jnp.exp(z[-1]) if system.period is None else jnp.asarray(system.period, x.dtype) * self.order
 
-    def unknowns(self, y0: Y, period: Scalar, autonomous: bool) -> Array:
-        """The state; of an autonomous system the logarithm of the period is unknown too."""
-        return jnp.append(ravel(y0), jnp.log(period)) if autonomous else ravel(y0)
-
     @property
     def part(self) -> float:
         """Of the period, over which the equations integrate."""
@@ -68,6 +64,12 @@ class Shooting(NamedTuple):
         x = z[: len(last)]
         gap = last - (x if self.symmetry is None else ravel(self.symmetry(unravel(x))))
         return gap if section is None else jnp.append(gap, section.height(x))
+
+
+@interactive
+def _unknowns(y0: Y, period: Scalar, autonomous: bool) -> Array:
+    """The state; of an autonomous system the logarithm of the period is unknown too."""
+    return jnp.append(ravel(y0), jnp.log(period)) if autonomous else ravel(y0)
 
 
 class _Section(NamedTuple):
@@ -114,9 +116,7 @@ def _searched(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Sca
         return shooting.equations(z, _reached(sol), section, unravel)
 
     # What depends on parameters does so by the second argument alone: the search needs no derivatives.
-    z, converged = find_root(
-        residual, shooting.unknowns(guess, first_period, autonomous), (system, t0), shooting.newton
-    )
+    z, converged = find_root(residual, _unknowns(guess, first_period, autonomous), (system, t0), shooting.newton)
     x = z[:-1] if autonomous else z
     period = shooting.period(x, z, system)
     shares = jnp.asarray(fractions(autonomous, shooting.order)[1], t0.dtype)
@@ -144,8 +144,8 @@ def _search(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scala
 
     if system.period is None:
         base = y0, period, (mode or {}) | (relays_at(system, t0, y0, mode) or {}) or None
-        base = look(shooting.unknowns(y0, period, True), LAPS, unsure).base
-    z, converged = shooting.unknowns(*base[:2], system.period is None), unsure
+        base = look(_unknowns(y0, period, True), LAPS, unsure).base
+    z, converged = _unknowns(*base[:2], system.period is None), unsure
     for _ in range(shooting.newton.max_iterations):
         z, ended, converged = look(z, shooting.part, unsure).step
         if ended:

@@ -5,10 +5,12 @@ import re
 import textwrap
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import Array
+from models import Heat, Motion, Thermostat
 
 import nsjax
 
@@ -37,31 +39,24 @@ def test_a_forced_model_says_its_period_as_in_the_readme():
     exec(textwrap.dedent(block), namespace)
     forced = type("Forced", (Driven,), {"period": namespace["period"]})
     orbit = nsjax.find_orbit(forced(), Line(0.0))
-    np.testing.assert_allclose(orbit.y0.x, 1 / 5, atol=1e-10)
+    np.testing.assert_allclose(orbit.y0.x, 1 / 5, atol=1e-12)
     assert "period" in nsjax.System.__doc__
 
 
 def test_the_surfaces_of_a_relay_are_levels():
     """A relay that starts on where it should be off switches off at once, as its docstring says."""
 
-    class Heater(nsjax.System):
-        def vector_field(self, t, y, s):
-            return Line(-y.x + 2 * s.heater)
-
-        @nsjax.relay
-        def heater(self, t, y):
-            return 0.5 - y.x
-
-        @heater.off
-        def heater(self, t, y):
-            return y.x - 1.0
-
     assert "levels and not edges" in nsjax.relay.__doc__
-    sol = nsjax.solve(Heater(), 0.0, 0.5, Line(1.2), mode={"heater": 1})
-    np.testing.assert_allclose(sol.y1.x, 1.2 * np.exp(-0.5), rtol=1e-7)
+    system = Thermostat()
+    sol = nsjax.solve(system, 0.0, 0.2, Heat(25.0), mode={"heater": 1})
+    np.testing.assert_allclose(sol.y1.T, 5 + 20 * np.exp(-0.2), rtol=1e-8)
     assert not sol.mode1.any()
 
 
 def test_what_cannot_be_vmapped_is_named():
     text = " ".join(README.split())
     assert "can be vmapped, except what runs in Python" in text
+    with pytest.raises(ValueError, match="`order` must be given under `jit` and `vmap`"):
+        jax.vmap(lambda x: nsjax.find_orbit(nsjax.gallery.thesis("6.8"), Motion(x, 0.0), order=None).period)(
+            jnp.ones(2)
+        )

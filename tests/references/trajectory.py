@@ -170,7 +170,7 @@ class Solved(NamedTuple):
 
 
 def tightly(system, t1, y0, solver, max_events: int):
-    """The solution that is compared with a reference of up to so many events."""
+    """The solution that is compared with a reference of at most `max_events` events: with room for a few more."""
     return solve(
         system,
         0.0,
