@@ -12,6 +12,7 @@ HERE = pathlib.Path(__file__).parent
 RUNS = (
     ("sweep.py", "--workload", "S1", "S2", "S3", "--batch", "256", "--out", "sweep.json"),
     ("cost.py", "--out", "cost.json"),
+    ("first_answer.py", "--out", "first_answer.json"),
     ("growth.py", "--out", "growth"),
     ("orbits.py", "--out", "orbits.json"),
     ("branches.py", "--out", "branches.json"),

@@ -205,8 +205,13 @@ def main() -> None:
             command = [sys.executable, __file__, "--one", name]
             done = subprocess.run(command, env=environment, capture_output=True, text=True)
             if done.returncode:
+                if "ModuleNotFoundError" in done.stderr:
+                    break
                 raise SystemExit(f"{name} failed:\n{done.stderr}")
             runs.append(json.loads(done.stdout.splitlines()[-1]))
+        if not runs:
+            print(f"| {name} | not installed | | | | | |", flush=True)
+            continue
         table[name] = row = {k: float(np.median([run[k] for run in runs])) for k in runs[0]}
         ratio = row["first"] / table[UNIT]["first"] if UNIT in table else float("nan")
         cells = [f"{row[k]:.2f}" for k in ("imports", "traces", "compiles")] + [f"{row['again']:.3f}"]
