@@ -5,16 +5,15 @@ from typing import Any
 import diffrax as dfx
 import jax
 import jax.flatten_util as jfu
-import jax.lax as lax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from .._numerics._compile import interactive
 from .._types import Scalar, Y
+from ..derivatives._flow_map import with_room
 from ..derivatives._variational import arcs
 from ..flow._integrator import Integrator
-from ..flow._results import is_okay, RESULTS
+from ..flow._results import is_okay
 from ..flow._solution import Solution
 from ..flow._solve import integrate
 from ..system._clock import clock
@@ -42,14 +41,8 @@ def base_point(
     of relays there, which within a hysteresis only the solution knows.
     """
     end_time = t0 + sign * LAPS * period
-    integrator = roomy(integrator)
-    sol = integrate(system, t0, end_time, y0, integrator, mode=mode, saveat=dfx.SaveAt(dense=True))
+    sol = integrate(system, t0, end_time, y0, with_room(integrator, t0.dtype), mode=mode, saveat=dfx.SaveAt(dense=True))
     return base_on(sol, t0, y0, period, sign)
-
-
-def roomy(integrator: Integrator) -> Integrator:
-    """The same with room for the events of several periods: its bound is meant for one."""
-    return integrator._replace(max_events=3 * integrator.max_events)
 
 
 def base_on(sol: Solution, t0: Scalar, y0: Y, period: Scalar, sign: float) -> tuple[Y, Scalar, Relays]:
@@ -112,46 +105,6 @@ def at_start(model: SwitchedSystem, t: Scalar, y: Y, given: Relays = None) -> An
 
 
 @interactive
-def settle_down(
-    system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrator: Integrator
-) -> tuple[Y, Scalar, Bool[Array, ""], Relays]:
-    """Follows the solution (backwards if `sign` is -1) to where it settles; for an autonomous system also the time in
-    which it returns there (0 if it does not), and whether it comes to rest; and the modes of relays there.
-
-    How long that takes is measured in steps of the integration, which know the system's own scale of time.
-    """
-    if system.period is not None:
-        last, at_last, _ = _laps(system, t0, y0, sign, mode, integrator, 100)
-        period = jnp.asarray(system.period, t0.dtype)
-        return last, period, jnp.zeros((), bool), of_relays(system, at_last)
-    # Only a guess is wanted: a loose tolerance makes long steps, and so the solution is followed farther.
-    loose = 1e-6 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4
-    controller = dfx.PIDController(rtol=loose, atol=loose)
-    big = Integrator(integrator.solver, controller, max_steps=2000, max_events=1000)
-    last = integrate(system, t0, t0 + sign * 1e9, y0, big, mode=mode)
-    given = tuple(last.mode1) if system.switches else None
-    loop = integrate(system, t0, t0 + sign * 1e9, last.y1, big, mode=given, saveat=dfx.SaveAt(dense=True))
-    starts, stops, points, _, steps = loop.dense
-    # Eight points a step: the polynomial between control points bends little.
-    u = jnp.asarray(np.arange(8) / 8, starts.dtype)
-    times = sign * (starts[:, None] + (stops - starts)[:, None] * u).ravel()
-    valid = jnp.repeat(jnp.arange(len(starts), dtype=steps.dtype) < steps, 8)
-    states = jax.vmap(lambda t: ravel(loop.evaluate(t)))(jnp.where(valid, times, t0))
-    here = ravel(last.y1)
-    scale = jnp.max(jnp.where(valid[:, None], jnp.abs(states - here), 0), axis=0)
-    gap = jnp.max(jnp.abs(states - here) / jnp.where(scale == 0, 1, scale), axis=-1)
-    gap = jnp.where(valid, gap, jnp.inf)
-    # The first local minimum of the distance that is small, once the solution has been far away.
-    far = jnp.cumsum(gap > 0.3) > 0
-    near = far & (gap < 0.1)
-    low = near & (gap <= jnp.roll(gap, 1)) & (gap <= jnp.roll(gap, -1))
-    ended = (last.result == RESULTS.max_steps_reached) | (last.result == RESULTS.successful)
-    rests = ended & (jnp.max(scale) <= 1e-4 * (1 + jnp.max(jnp.abs(here))))
-    period = jnp.where(rests, 0, sign * (times[jnp.argmax(low)] - t0))
-    return last.y1, period, rests, of_relays(system, last.mode1)
-
-
-@interactive
 def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
     """Whether an equilibrium of the sliding field is one of a continuum: on the surfaces that hold it the derivative of
     the field is singular."""
@@ -182,43 +135,3 @@ def held_throughout(system: System, begin: Array, end: Array, modes: Array) -> B
         jnp.sum(jnp.where(modes[:, i] == 0, 0, length)) for i, k in enumerate(system.switches) if isinstance(k, sgn)
     ]
     return jnp.any(jnp.asarray(free, length.dtype) <= 1e-3 * jnp.sum(length))
-
-
-@interactive
-def repeats_held(
-    system: System, t0: Scalar, y: Y, period: Scalar, mode: Any, integrator: Integrator
-) -> Bool[Array, ""]:
-    """Whether a state of a forced system comes back, held by friction all the time."""
-    sol = integrate(system, t0, t0 + period, y, integrator, mode=mode)
-    begin, end, _, modes = arcs(sol, t0, y)
-    back = distance(ravel(sol.y1), ravel(y)) <= 1e-8 * (1 + jnp.max(jnp.abs(ravel(y))))
-    return is_okay(sol.result) & back & held_throughout(system, begin, end, modes)
-
-
-def _laps(
-    system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrator: Integrator, number: int
-) -> tuple[Y, tuple, Float[Array, "laps n"]]:
-    """A solution of a forced system after `number` periods, its mode, and its states after each. The bounds of
-    `integrator` are those of one period."""
-    end = t0 + sign * jnp.asarray(system.period, t0.dtype)
-
-    def lap(here: tuple, _: Any) -> tuple[tuple, Array]:
-        y, mode = here
-        sol = integrate(system, t0, end, y, integrator, mode=mode if system.switches else None)
-        return (sol.y1, tuple(sol.mode1)), ravel(sol.y1)
-
-    first = integrate(system, t0, end, y0, integrator, mode=mode)
-    (last, at_last), later = lax.scan(lap, (first.y1, tuple(first.mode1)), None, length=number - 1)
-    return last, at_last, jnp.concatenate([ravel(first.y1)[None], later])
-
-
-@interactive
-def repeats(
-    system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrator: Integrator, most: int = 16
-) -> Int[Array, ""]:
-    """After how many periods of the forcing a solution that has settled repeats itself."""
-    _, _, points = _laps(system, t0, y0, sign, mode, integrator, most)
-    gaps = distance(points, ravel(y0))
-    # What is left of the way to where it settles is small beside the state, and beside how far the points lie apart.
-    extent = 1e-4 * jnp.max(jnp.abs(points)) + 1e-2 * jnp.max(gaps)
-    return 1 + jnp.argmax(gaps <= jnp.maximum(extent, 2 * jnp.min(gaps)))

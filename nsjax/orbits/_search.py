@@ -16,8 +16,9 @@ from .._types import Scalar, Y
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
 from ..system._system import System
-from ._guess import held_throughout, of_relays, repeats, repeats_held, settle_down, sticks_anywhere, undecided
+from ._guess import held_throughout, of_relays, sticks_anywhere, undecided
 from ._orbit import Orbit
+from ._settle import repeats, repeats_held, settle_down, Settled
 from ._shooting import Shooting
 from .segments._guess import cuts_from, cuts_near, Segment
 from .segments._solve import by_segments
@@ -62,7 +63,7 @@ class Search(NamedTuple):
             return self._from_nothing(system, y0)
         if self.order is None and system.period is not None:
             start, _, _, mode = self._settled(system, y0)
-            order = int(repeats(system, self.t0, start, self.sign, mode, self.integrator))
+            order = repeats(system, self.t0, start, self.sign, mode, self.integrator)
             return self._tries(system, start, jnp.ones_like(self.t0), order, mode)
         period = jnp.asarray(1.0 if period is None else period, self.t0.dtype)
         if self.concrete and not period > 0:
@@ -99,8 +100,9 @@ class Search(NamedTuple):
         sticks = sticks_anywhere(frozen(system), self.t0, y)
         return RESULTS.where(sticks, RESULTS.orbit_sticks_for_ever, RESULTS.orbit_is_equilibrium)
 
-    def _settled(self, system: System, y0: Y) -> tuple[Y, Scalar, Any, Any]:
-        return settle_down(frozen(system), self.t0, lax.stop_gradient(y0), self.sign, self.mode, self.integrator)
+    def _settled(self, system: System, y0: Y) -> Settled:
+        y0 = lax.stop_gradient(y0)
+        return settle_down(frozen(system), self.t0, y0, self.sign, self.mode, self.integrator, self.concrete)
 
     def _from_nothing(self, system: System, y0: Y) -> Orbit:
         """Of an autonomous system, without a guess of the period."""

@@ -17,6 +17,7 @@ from .._numerics._compile import interactive
 from .._numerics._root import find_root, Newton
 from .._types import Scalar, Y
 from ..derivatives._floquet import floquet, forwards, structural_zeros
+from ..derivatives._flow_map import Directions, flow_map, with_room
 from ..derivatives._variational import arcs, AT_ONCE, monodromy_by_arcs
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
@@ -25,7 +26,7 @@ from ..flow._solve import integrate
 from ..system._model import SwitchedSystem
 from ..system._relay import relay
 from ..system._system import System
-from ._guess import at_start, base_on, base_point, LAPS, relays_at, roomy
+from ._guess import at_start, base_on, base_point, LAPS, relays_at
 from ._orbit import distance, fractions, judge, Orbit, ravel
 from .segments._arcs import Arcs
 
@@ -137,10 +138,15 @@ class _Trial(NamedTuple):
 
 def _search(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scalar, mode: Any) -> Orbit:
     """The search, step by step."""
-    unsure, base = jnp.zeros((), bool), (y0, period, mode)
+    unsure, base, integrator = np.zeros((), bool), (y0, period, mode), with_room(shooting.integrator, t0.dtype)
+    directions = Directions.of_state(system, t0, y0)
+    directions = directions._replace(t1=np.eye(len(directions.t1), dtype=t0.dtype)[-1])
 
     def look(z: Array, laps: float, converged: Any, **how: bool) -> _Trial:
-        return _tried(shooting, system, t0, base, z, jnp.asarray(laps, t0.dtype), converged, **how)
+        number = np.asarray(laps, t0.dtype)
+        t1, start = _posed(shooting, system, t0, base[0], z, number)
+        passage = flow_map(system, t0, t1, start, base[2], integrator, directions)
+        return _tried(shooting, system, t0, base, z, number, passage, converged, **how)
 
     if system.period is None:
         base = y0, period, (mode or {}) | (relays_at(system, t0, y0, mode) or {}) or None
@@ -162,6 +168,14 @@ def _based_on_event(orbit: Orbit) -> bool:
 
 
 @interactive
+def _posed(shooting: Shooting, system: System, t0: Scalar, guess: Y, z: Array, laps: Scalar) -> tuple[Scalar, Y]:
+    """The time of the end, and the state at the start, that belong to unknowns."""
+    x = z[:-1] if system.period is None else z
+    end = t0 + shooting.sign * laps * shooting.period(x, z, system)
+    return end, jfu.ravel_pytree(guess)[1](x)
+
+
+@interactive
 def _tried(
     shooting: Shooting,
     system: System,
@@ -169,27 +183,22 @@ def _tried(
     base: tuple[Y, Scalar, Any],
     z: Array,
     laps: Scalar,
+    passage: tuple[Solution, Array],
     converged: Any,
     *,
     by_arcs: bool = False,
 ) -> _Trial:
-    """The solution over so many periods, from the unknowns z; the guesses of state, period and modes, on which the
-    section stands. `by_arcs`: whether the monodromy matrix is that of the saltation formula, and not the derivative of
-    the flow."""
+    """What is made of the `passage` over so many periods from the unknowns z: the solution, and the derivatives of its
+    end by state and time. The section stands on the guesses of state, period and modes. `by_arcs`: whether the
+    monodromy matrix is that of the saltation formula, and not the derivative of the flow."""
     (guess, first, mode), sign, autonomous = base, shooting.sign, system.period is None
-    integrator = roomy(shooting.integrator) if autonomous else shooting.integrator
+    sol, tangents = passage
+    monodromy, speed = tangents[:-1].T, tangents[-1]
     unravel = jfu.ravel_pytree(guess)[1]
     x = z[:-1] if autonomous else z
     period = shooting.period(x, z, system)
     section = _Section.through(system, t0, guess, first, mode) if autonomous else None
-
-    def flow(x: Array, span: Scalar) -> tuple[Array, Solution]:
-        dense = dfx.SaveAt(dense=True)
-        sol = integrate(system, t0, t0 + span, unravel(x), integrator, mode=mode, saveat=dense, still=True)
-        return _reached(sol), sol
-
     span = sign * laps * period
-    (monodromy, speed), sol = jax.jacfwd(flow, (0, 1), has_aux=True)(x, span)
 
     def residual(z: Array) -> Array:
         # The derivatives of the end are known.
@@ -202,7 +211,7 @@ def _tried(
     shares = jnp.asarray(fractions(autonomous, shooting.order)[1], t0.dtype)
     later = jax.vmap(lambda t: ravel(sol.evaluate(t)))(t0 + sign * period * shares)
     one = sol.within(shooting.integrator.max_events)
-    monodromy = monodromy_by_arcs(system, one, t0, unravel(x), integrator) if by_arcs else monodromy
+    monodromy = monodromy_by_arcs(system, one, t0, unravel(x), shooting.integrator) if by_arcs else monodromy
     orbit = _described(shooting, one, unravel(x), period, (later, monodromy), section, mode, converged)
     return _Trial(better, step, orbit)
 

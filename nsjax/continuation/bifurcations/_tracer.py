@@ -9,7 +9,7 @@ import numpy as np
 from ..._numerics._bracket import bracketed
 from ...orbits.segments._equations import linearised
 from ..orbits._test_functions import BRANCH, CORNERS, Test
-from ..orbits._tracer import FIRST, OrbitPoint, SHORTEST, TURN, TURNED
+from ..orbits._tracer import FIRST, LAST_FOUND, OrbitPoint, SHORTEST, TURN, TURNED
 from ..orbits.corners._grazing import cut_itinerary
 from ._surface import AbstractBifurcationTracer, BifurcationTracer, cleared, CUSP, DELTA, Place, RESONANCES, seen_at
 
@@ -55,7 +55,7 @@ def trace(locus: AbstractBifurcationTracer, place: Place, max_step: float, max_p
         except FAILED:
             length /= 2
             if length < SHORTEST:
-                out.why = "the last orbit that could be found"
+                out.why = LAST_FOUND
                 return out
             continue
         for met in found:

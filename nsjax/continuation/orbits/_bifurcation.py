@@ -66,7 +66,8 @@ class OrbitBifurcation(AbstractSpecialPoint):
     - `kind`: "fold", "flip", "Neimark-Sacker", "symmetry breaking", "transcritical"; "fold-flip" where set-valued
         multipliers cross the circle at both 1 and -1 (section 6.9); "infinitely unstable fold" where one jumps from 0
         to infinity (section 6.7); "multiple crossing", or "3 to 1" (the numbers below and above) for what has no
-        name; "none" where the itinerary changes without a bifurcation, "end" where there is no orbit nearby beyond.
+        name; "none" where the itinerary changes without a bifurcation; "end" where there is no orbit nearby beyond,
+        "continuum" where beyond friction holds every state of a continuum.
     - `discontinuous`: whether it is a corner: multipliers jump there.
     - `criticality`: "supercritical", "subcritical", or None if the kind knows no such thing.
     - `evidence`: what supports the kind: "count" of the orbits (Definition 5.1), "crossing" of the unit circle by
@@ -86,7 +87,7 @@ class OrbitBifurcation(AbstractSpecialPoint):
     - `origin`: what `continue_bifurcation` sets out from; None if the point was loaded.
     """
 
-    plain = {"end": "end of the branch"}
+    plain = {"end": "end of the branch", "continuum": "end of the branch in a continuum of orbits"}
 
     kind: str
     discontinuous: bool
@@ -190,11 +191,13 @@ class OrbitBifurcation(AbstractSpecialPoint):
         )  # fmt: skip
 
     @classmethod
-    def end(cls, name: str, spot: Any, curve: Any, surfaces: tuple[str, ...], side: int) -> "OrbitBifurcation":
-        """Where the orbits on one side have none nearby to go on to."""
+    def end(
+        cls, name: str, spot: Any, curve: Any, surfaces: tuple[str, ...], side: int, kind: str
+    ) -> "OrbitBifurcation":
+        """Where the orbits on one side have none nearby to go on to, or a continuum."""
         below, above = (((1,) if side == s else ()) for s in (-1, 1))
         return cls(
-            kind="end", discontinuous=True, criticality=None, evidence="count", by_count="end", by_crossing=None,
+            kind=kind, discontinuous=True, criticality=None, evidence="count", by_count="end", by_crossing=None,
             transition=None, count=(below, above), surfaces=surfaces, crossings=[], halves=[],
             multipliers=(spot.multipliers, spot.multipliers), monodromies=(spot.monodromy, spot.monodromy),
             **_common(name, spot, curve),

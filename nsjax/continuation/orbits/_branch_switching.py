@@ -7,9 +7,9 @@ import equinox as eqx
 import numpy as np
 
 from ...maps._corner_normal_form import Cycle
-from ...orbits.segments._equations import linearised, OrbitCurve, state_at
+from ...orbits.segments._equations import linearised, OrbitCurve
 from ...orbits.segments._itinerary import capacity_for, OrbitItinerary, Start, TIME
-from ...orbits.segments._point import correct, Plane
+from ...orbits.segments._point import correct, Plane, state_at
 from ._bifurcation import OrbitBifurcation, OrbitHalfBranch
 from ._test_functions import CORNERS
 from ._tracer import alike, midpoint, OrbitPoint, OrbitTracer, spot_of, test_values, turned, Zero
@@ -183,8 +183,8 @@ def cover_of(spot: OrbitPoint, curve: OrbitCurve, tolerance: float = 1e-4) -> in
     def away(times: int) -> float:
         later = float(look.begin[0]) + (t - float(look.begin[0]) + period / times) % period
         i = next((i for i in range(n) if look.begin[i] <= later <= look.end[i]), n - 1)
-        args = (look.parameter, look.begin[i], later, look.x[i], spot.itinerary.mode[i], spot.itinerary.part[i])
-        return float(np.max(np.abs(np.asarray(state_at(curve, *args)) - x) / np.asarray(curve.sizes)))
+        there = state_at(curve, spot.itinerary, look, i, later)
+        return float(np.max(np.abs(there - x) / np.asarray(curve.sizes)))
 
     most = MOST_LAPS if curve.autonomous else order
     several = [k for k in range(most, 1, -1) if curve.autonomous or order % k == 0]

@@ -13,8 +13,8 @@ from ._branch import OrbitBranchSegment, Point
 from ._branch_switching import admissible, Departure, Node, tracer_for
 from ._record import Recorder
 from ._test_functions import CORNERS, PASSED
-from ._tracer import alike, OrbitPoint, OrbitTracer, SAME, Trace, turned
-from .corners._corner import node_at
+from ._tracer import alike, LAST_FOUND, OrbitPoint, OrbitTracer, SAME, Trace, turned
+from .corners._corner import held_beyond, node_at
 from .corners._grazing import exactly
 
 
@@ -155,7 +155,10 @@ class OrbitExplorer:
         trace, zero = walk.trace, walk.trace.end
         tracer, order = tracer_for(self.tracer, walk.curve), int(walk.curve.order)
         if zero is None:
-            return self.end(tree, CLOSED if trace.closed else trace.why)
+            why, last = CLOSED if trace.closed else trace.why, trace.spots[-1]
+            if why.startswith(LAST_FOUND) and held_beyond(walk.curve, last, -int(np.sign(last.look.tangent[-1]))):
+                why += ", beside a continuum of orbits that friction holds"
+            return self.end(tree, why)
         if zero.test.kind in ("low", "high"):
             return self.end(tree, f"{self.name} = {zero.spot.parameter:.6g}")
         zero = exactly(tracer, zero) or zero

@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
@@ -12,9 +11,9 @@ from ..._types import Y
 from ...flow._integrator import Integrator
 from ...flow._results import is_okay
 from ...orbits._orbit import Orbit
-from ...orbits.segments._equations import guard_sizes, OrbitCurve
+from ...orbits.segments._equations import field_at, guard_sizes, OrbitCurve
 from ...orbits.segments._itinerary import Start, starts_of
-from ...orbits.segments._segment_flow import exactness, fits, NEVER
+from ...orbits.segments._segment_flow import exactness, fits, NEVER, SegmentFlow, states_along
 from ...system._model import SwitchedSystem
 from ...system._parameter import get_parameter, parameter_path
 from ...system._system import arrays_of, System
@@ -48,28 +47,30 @@ def curve_and_start(
             f"Argument `interval` must be (low, high) and hold {value:.6g}, the value of `{parameter}` in "
             f"`system`, but is ({low:.6g}, {high:.6g})."
         )
+    told = None if scale is None else _checked_scale(orbit.y0, scale)
     model = SwitchedSystem.forwards(system, orbit.t0, orbit.y0)
     (start,) = starts_of(model, [orbit])
-    sizes = sizes_of(orbit, scale)
+    n = len(start.x[0])
     curve = OrbitCurve(
         model=model,
         path=path,
         like=orbit.y0,
         low=np.asarray(low),
         width=np.asarray(high - low),
-        sizes=sizes,
+        sizes=np.ones(n),
         time=np.asarray(float(orbit.period)),
         guard_sizes=np.ones(len(model.slots)),
         order=order_of(system, orbit),
-        normal=np.zeros_like(sizes),
-        reference=np.zeros_like(sizes),
+        normal=np.zeros(n),
+        reference=np.zeros(n),
         integrator=integrator,
         exact=exactness(model, jnp.asarray(orbit.t0), orbit.y0),
     )
+    curve = dataclasses.replace(curve, exact=_exact(curve, start, value))
+    curve = dataclasses.replace(curve, sizes=_sizes(curve, start, value) if told is None else told)
     normal, reference = phase_of(curve, start)
     curve = dataclasses.replace(curve, normal=normal, reference=reference)
-    curve = dataclasses.replace(curve, guard_sizes=guard_sizes(curve, start))
-    return dataclasses.replace(curve, exact=_exact(curve, start, value)), start
+    return dataclasses.replace(curve, guard_sizes=guard_sizes(curve, start)), start
 
 
 def order_of(system: System, orbit: Orbit) -> Int[np.ndarray, ""]:
@@ -78,28 +79,34 @@ def order_of(system: System, orbit: Orbit) -> Int[np.ndarray, ""]:
     return np.asarray(order, np.int32)
 
 
+def _segments(curve: OrbitCurve, start: Start, value: float) -> tuple[SegmentFlow, list[tuple]]:
+    """The flow of the segments, and for each what there is to say of it: times, first state, parameter and mode."""
+    itinerary = start.itinerary
+    states = [curve.state(itinerary.mode[i], itinerary.part[i]) for i in itinerary.rows]
+    rows = zip(start.begin, start.end, start.x, states)
+    return curve.on(itinerary).flow, [(a, b, x, np.asarray(value), state) for a, b, x, state in rows]
+
+
 def _exact(curve: OrbitCurve, start: Start, value: float) -> int:
     """Which flows are known by their exponentials, given the forcing along the orbit."""
     if curve.exact == NEVER:
         return NEVER
-    flow, itinerary = curve.on(start.itinerary).flow, start.itinerary
-    states = [curve.state(jnp.asarray(itinerary.mode[i]), jnp.asarray(itinerary.part[i])) for i in itinerary.rows]
-    rows = zip(start.begin, start.end, start.x, states)
-    known = all(bool(fits(flow, a, b, x, jnp.asarray(value), state)) for a, b, x, state in rows)
-    return curve.exact if known else NEVER
+    flow, rows = _segments(curve, start, value)
+    return curve.exact if all(bool(fits(flow, *row)) for row in rows) else NEVER
 
 
-def sizes_of(orbit: Orbit, scale: Y | None) -> np.ndarray:
-    """The typical size of each component of the state: half its range along the orbit, unless told; of an orbit that is
-    at rest its distance from zero, or one."""
-    path = orbit.path(33)
-    rows = jax.vmap(jax.vmap(lambda y: jfu.ravel_pytree(y)[0]))(path.y)
-    rows = np.asarray(rows).reshape(-1, rows.shape[-1])
-    if scale is not None:
-        sizes = np.abs(np.asarray(jfu.ravel_pytree(scale)[0], np.float64))
-        if sizes.shape != rows.shape[1:] or not np.all(sizes > 0):
-            raise ValueError("Argument `scale` must hold a positive number for each component of the state.")
-        return sizes
+def _checked_scale(like: Y, scale: Y) -> np.ndarray:
+    sizes, x = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(y)]) for y in (scale, like))
+    if sizes.shape != x.shape or not np.all(np.abs(sizes) > 0):
+        raise ValueError("Argument `scale` must hold a positive number for each component of the state.")
+    return np.abs(sizes).astype(np.float64)
+
+
+def _sizes(curve: OrbitCurve, start: Start, value: float) -> np.ndarray:
+    """The typical size of each component of the state: half its range along the orbit; of an orbit that is at rest its
+    distance from zero, or one."""
+    flow, segments = _segments(curve, start, value)
+    rows = np.concatenate([np.asarray(states_along(flow, *segment)) for segment in segments])
     rows = rows[np.isfinite(rows).all(axis=1)]
     sizes = np.ptp(rows, axis=0) / 2
     largest, away = sizes.max(), np.abs(rows).max()
@@ -113,6 +120,6 @@ def phase_of(curve: OrbitCurve, start: Start) -> tuple[np.ndarray, np.ndarray]:
     x = np.asarray(start.x[0])
     if not curve.autonomous:
         return np.zeros_like(x), x
-    state = curve.state(jnp.asarray(start.itinerary.mode[0]), jnp.asarray(start.itinerary.part[0]))
-    f = np.asarray(jfu.ravel_pytree(curve.model.flow(jnp.asarray(start.begin[0]), curve.unravel(x), state))[0])
+    at = np.asarray(start.begin[0]), x, start.itinerary.mode[0], start.itinerary.part[0]
+    f = np.asarray(field_at(curve, jnp.asarray(get_parameter(curve.model.system, curve.path)), *at))
     return f / np.maximum(f @ f, 1e-300), x

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from ..._numerics._bracket import bracketed
-from ...orbits.segments._equations import OrbitCurve, state_at
+from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import OrbitItinerary
-from ...orbits.segments._point import correct, Plane, PointData
+from ...orbits.segments._point import correct, Plane, PointData, state_at
 from ._test_functions import (
     BRANCH,
     branch_value,
@@ -24,6 +24,7 @@ from ._test_functions import (
 )
 
 
+LAST_FOUND = "the last orbit that could be found"
 FIRST, SHORTEST = 1e-3, 1e-9  # steps, in units of the curve
 UNSEEN = 1e-6  # steps that are not shortened any more for the sake of a branch point
 TURN, TURNED = 0.15, 0.5  # the angles between tangents that are aimed at, and allowed
@@ -64,10 +65,8 @@ def midpoint(curve: OrbitCurve, spot: OrbitPoint, rows: Iterable[int]) -> tuple[
         length[i] = (look.end[i] - look.begin[i]) * (1e-6 if curve.model.holds(itinerary.mode[i]) else 1.0)
     longest = max(length.values())
     best = next(i for i in length if length[i] >= longest - 1e-6 * abs(longest))
-    t = np.asarray((look.begin[best] + look.end[best]) / 2)
-    mode = np.asarray(itinerary.mode[best])
-    x = state_at(curve, look.parameter, look.begin[best], t, look.x[best], mode, itinerary.part[best])
-    return float(t), np.asarray(x), mode
+    t = float(look.begin[best] + look.end[best]) / 2
+    return t, state_at(curve, itinerary, look, best, t), np.asarray(itinerary.mode[best])
 
 
 def test_values(curve: OrbitCurve, spot: OrbitPoint, log: float) -> dict[Test, float]:
@@ -190,7 +189,7 @@ class OrbitTracer:
                 break
             length /= 2
             if length < SHORTEST:
-                return dataclasses.replace(trace, why=f"the last orbit that could be found, at {spot.parameter:.10g}")
+                return dataclasses.replace(trace, why=f"{LAST_FOUND}, at {spot.parameter:.10g}")
         zeros = tuple(z for z in zeros if z.test.kind != "Neimark-Sacker" or _complex_pair(z.spot))
         if zeros and zeros[-1].test.kind not in PASSED:
             return dataclasses.replace(trace, ahead=zeros)

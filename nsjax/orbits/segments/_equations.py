@@ -201,10 +201,26 @@ def row_sizes(df: Array) -> Array:
 
 
 @interactive
-def state_at(curve: OrbitCurve, value: Array, a: Scalar, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
-    """The state at a time in a segment. (Between steps the states of a `PointData` are those of the solver's dense
-    output, less exact than the steps.)"""
-    return curve.flow.arrive(a, t, x, value, curve.state(mode, part))
+def field_at(curve: OrbitCurve, value: Array, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
+    """The field in a mode."""
+    model = curve.model.with_parameter(curve.path, value)
+    return jfu.ravel_pytree(model.flow(t, curve.unravel(x), curve.state(mode, part)))[0]
+
+
+@interactive
+def guards_along(
+    curve: OrbitCurve, value: Array, t: Scalar, x: Array, mode: Array, part: Array
+) -> tuple[Array, Array, Array]:
+    """All guards in a mode, `[slot, part]`, and their first and second derivatives along the flow."""
+    model, state = curve.model.with_parameter(curve.path, value), curve.state(mode, part)
+
+    def along(t: Scalar, x: Array) -> tuple[Array, Array]:
+        f = jfu.ravel_pytree(model.flow(t, curve.unravel(x), state))[0]
+        return jax.jvp(lambda t, x: curve.guards(model, t, x, state), (t, x), (jnp.ones_like(t), f))
+
+    f = jfu.ravel_pytree(model.flow(t, curve.unravel(x), state))[0]
+    (values, rates), (_, bends) = jax.jvp(along, (t, x), (jnp.ones_like(t), f))
+    return values, rates, bends
 
 
 def linearised(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> Array:

@@ -16,6 +16,7 @@ from ...derivatives._floquet import floquet, structural_zeros
 from ...system._model import SwitchedSystem
 from ._equations import OrbitCurve, row_sizes
 from ._itinerary import EVENT, OrbitItinerary, REPELLING_EXIT, TIME
+from ._segment_flow import states_along
 
 
 TOLERANCE = 1e-12  # of Newton's method, in units of the unknowns
@@ -72,6 +73,14 @@ class PointData(NamedTuple):
     turns_x: Array
     branch: Array
     residual: Scalar
+
+
+def state_at(curve: OrbitCurve, itinerary: OrbitItinerary, look: PointData, i: int, t: float) -> np.ndarray:
+    """The state at a time in segment i. (Between steps the states of a `PointData` are those of the solver's dense
+    output, less exact than the steps.)"""
+    state = curve.state(itinerary.mode[i], itinerary.part[i])
+    flow = curve.on(itinerary).flow
+    return np.asarray(states_along(flow, look.begin[i], np.asarray(t), look.x[i], look.parameter, state))[-1]
 
 
 class Plane(NamedTuple):

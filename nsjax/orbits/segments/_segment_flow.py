@@ -103,6 +103,12 @@ def fits(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state:
     return jnp.all(jax.vmap(at)(a + (b - a) * jnp.asarray([0.0, 0.2764, 0.6180], x.dtype)))
 
 
+@interactive
+def states_along(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> Array:
+    """States along a segment, see `SegmentFlow.along`."""
+    return flow.along(a, b, x, value, state)[1]
+
+
 class _Summed(ModeFlow):
     """The field of one mode, and the integrals of the state and of its squares."""
 

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 
 from ....maps._corner_normal_form import corner_kind, CornerMap, Cycle, Cycles, find_cycles
+from ....orbits._settle import repeats_held
 from ....orbits.segments._equations import linearised, OrbitCurve
 from ....orbits.segments._itinerary import capacity_for, EVENT, GRAZING, REPELLING_EXIT, Start
 from ....setvalued._eigenvalue_crossings import eigenvalue_crossings
@@ -24,12 +25,13 @@ from .._branch_switching import (
     with_order,
 )
 from .._test_functions import CORNERS
-from .._tracer import OrbitPoint, OrbitTracer, Zero
+from .._tracer import midpoint, OrbitPoint, OrbitTracer, Zero
 from ._enter_half_branch import half_of, NEIGHBOUR
-from ._return_map import return_map, ReturnMap, Touch, touches_of
+from ._return_map import MAX_EVENTS, return_map, ReturnMap, Touch, touches_of
 
 
 KNOWN = 1e-6  # the digits of a normal form
+BEYOND = 1e-4  # of the interval, behind the end of a branch: there it is seen what its orbits go over into
 
 
 def node_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | None:
@@ -272,11 +274,25 @@ def repelled_at(tracer: OrbitTracer, name: str, spot: OrbitPoint, rows: list[int
     return Node(spot, int(curve.order), halves, made)
 
 
+def held_beyond(curve: OrbitCurve, spot: OrbitPoint, side: int) -> bool:
+    """Whether beyond an orbit, of a branch that lies on this side of it, friction holds a forced system for ever."""
+    held = [i for i in spot.itinerary.rows if curve.model.holds(spot.itinerary.mode[i])]
+    if curve.autonomous or not held:
+        return False
+    t, x, _ = midpoint(curve, spot, held)
+    value = np.asarray(spot.parameter - side * BEYOND * float(curve.width))
+    system = curve.model.with_parameter(curve.path, value).system
+    period = np.asarray(float(system.period) * int(curve.order))
+    y, integrator = curve.unravel(x), curve.integrator._replace(max_events=MAX_EVENTS)
+    return repeats_held(system, np.asarray(t), y, period, None, integrator)
+
+
 def _end(tracer: OrbitTracer, name: str, zero: Zero) -> Node:
-    """No orbit nearby beyond this point."""
+    """No orbit nearby beyond this point, or a continuum of them."""
     itinerary = zero.spot.itinerary
     row = zero.test.row
     slot = zero.test.slot if zero.test.kind == "guard" else int(itinerary.slot[row])
     switch = tracer.curve.model.switches[tracer.curve.model.slots[slot].switch].name
-    made = OrbitBifurcation.end(name, zero.spot, tracer.curve, (switch,), zero.side)
+    kind = "continuum" if held_beyond(tracer.curve, zero.spot, zero.side) else "end"
+    made = OrbitBifurcation.end(name, zero.spot, tracer.curve, (switch,), zero.side, kind)
     return Node(zero.spot, int(tracer.curve.order), [], made)

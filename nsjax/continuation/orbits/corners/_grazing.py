@@ -2,13 +2,10 @@
 
 from typing import Any
 
-import jax
-import jax.flatten_util as jfu
-import jax.numpy as jnp
 import numpy as np
 
 from ...._numerics._bracket import bracketed
-from ....orbits.segments._equations import OrbitCurve
+from ....orbits.segments._equations import guards_along, OrbitCurve
 from ....orbits.segments._itinerary import capacity_for, EVENT, GRAZING, OrbitItinerary, Start, TIME
 from ....system._impact import impact
 from .._test_functions import Test
@@ -139,21 +136,12 @@ def cut_itinerary(
 
 def _component(curve: OrbitCurve, look: Any, itinerary: OrbitItinerary, i: int, j: int, t: float) -> int:
     """Of a guard with several components that which is least there: at a tip another one takes over."""
-    model = curve.model.with_parameter(curve.path, jnp.asarray(look.parameter))
-    state = curve.state(jnp.asarray(itinerary.mode[i]), jnp.asarray(itinerary.part[i]))
-    at = jnp.asarray(look.spots[i, j])
-    when = jnp.asarray(t)
-    values = np.asarray(curve.guards(model, when, at, state))[j]
+    at = look.parameter, np.asarray(t), look.spots[i, j], itinerary.mode[i], itinerary.part[i]
+    values, rates, bends = (np.asarray(rows)[j] for rows in guards_along(curve, *at))
     options = [p for p in range(len(values)) if np.isfinite(values[p])]
     if len(options) < 2:
         return options[0]
-    f = jfu.ravel_pytree(model.flow(when, curve.unravel(at), state))[0]
-
-    def motion(p: int) -> tuple[float, float]:
-        rate, bend = jax.jvp(lambda t, x: curve.rate(model, t, x, state, j, p), (when, at), (jnp.ones_like(when), f))
-        return float(rate), float(bend)
-
-    motions = [motion(p) for p in options]
+    motions = [(float(rates[p]), float(bends[p])) for p in options]
     best, least = options[0], np.inf
     for p, (rate, bend) in zip(options, motions):
         # Where it is least itself, is it the one that counts?

@@ -8,16 +8,16 @@ no finite distance would do.
 from typing import Any, NamedTuple
 
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 
 from ...._numerics._compile import interactive
+from ....derivatives._flow_map import Directions, flow_map, with_room
 from ....flow._results import is_okay
 from ....flow._solution import Events
-from ....flow._solve import integrate
 from ....maps._corner_normal_form import CornerMap
-from ....orbits.segments._equations import OrbitCurve
+from ....orbits._guess import of_relays
+from ....orbits.segments._equations import field_at, OrbitCurve
 from ....system._parameter import put_parameter
 from .._tracer import midpoint
 
@@ -26,7 +26,7 @@ LEVELS = 8  # distances from the corner
 REACHES = (0.1, 0.05, 0.02, 0.008)  # roots of the largest of them, in units of the curve
 NEAREST = 0.05  # the smallest of them over the largest: beside a tangency rounding is divided by little
 SAME = 1e-7  # relative: what jumps by less does not
-MAX_EVENTS = 64
+MAX_EVENTS = 64  # as `find_orbit` has by default, whose program is used again
 
 
 class Touch(NamedTuple):
@@ -59,33 +59,35 @@ class ReturnMap(NamedTuple):
 
 def follow(curve: OrbitCurve, xs: Any, values: Any, reference: Any, begin: Any, end: Any, modes: Any) -> tuple:
     """Pieces of laps: the states at their ends, the derivatives of these by state and parameter, the events, and
-    whether all went well; one after the other, as programs for batches are larger. Times are those of the phases of the
-    forcing for the value `reference` of the parameter."""
-    lanes = [map(np.asarray, lane) for lane in zip(xs, values, begin, end, modes)]
-    found = [jax.device_get(_followed(curve, np.asarray(reference), *lane)) for lane in lanes]
-    return jax.tree.map(lambda *rows: np.stack(rows), *found)
+    whether all went well. Times are those of the phases of the forcing for the value `reference` of the parameter."""
+    model, integrator = curve.model, with_room(curve.integrator._replace(max_events=MAX_EVENTS), np.float64)
+    directions = Directions.of_state(model.system, np.zeros(()), curve.like)
+    last = np.eye(len(curve.sizes) + 1)[-1]  # the parameter
+    directions = directions._replace(system=put_parameter(directions.system, curve.path, last))
+    rows = []
+    for x, value, a, b, mode in zip(xs, values, begin, end, modes):
+        slow, slower = (1.0, 0.0) if curve.autonomous else jax.device_get(_slowed(curve, value, np.asarray(reference)))
+        way = directions._replace(t0=a * slower * last, t1=b * slower * last)
+        given = (
+            {k.name: m for k, m in zip(model.switches, mode)} if model.holds(mode) else of_relays(model.system, mode)
+        )
+        system = put_parameter(model.system, curve.path, np.asarray(value))
+        times = np.asarray(a * slow), np.asarray(b * slow)
+        sol, tangents = flow_map(system, *times, curve.unravel(x), given, integrator, way)
+        y1 = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(sol.y1)])
+        rows.append((y1, tangents.T, sol.events, is_okay(sol.result)))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(rows))
 
 
 @interactive
-def _followed(
-    curve: OrbitCurve, reference: Any, x: Any, value: Any, a: Any, b: Any, mode: Any
-) -> tuple[jax.Array, jax.Array, Events, jax.Array]:
-    """One piece."""
+def _slowed(curve: OrbitCurve, value: Any, reference: Any) -> tuple[jax.Array, jax.Array]:
+    """The period of the forcing over that at the value `reference` of the parameter, and its derivative."""
 
-    def flow(z: jax.Array) -> tuple:
-        system = put_parameter(curve.model.system, curve.path, z[-1])
-        slow = jnp.ones_like(a)
-        if not curve.autonomous:
-            still = put_parameter(curve.model.system, curve.path, reference)
-            slow = jnp.asarray(system.period, a.dtype) / jnp.asarray(still.period, a.dtype)
-        given = tuple(mode) if curve.model.switches else None
-        integrator = curve.integrator._replace(max_events=MAX_EVENTS)
-        sol = integrate(system, a * slow, b * slow, curve.unravel(z[:-1]), integrator, mode=given, still=True)
-        end = jfu.ravel_pytree(sol.y1)[0]
-        return end, (end, sol.events, is_okay(sol.result))
+    def period(value: jax.Array) -> jax.Array:
+        return jnp.asarray(put_parameter(curve.model.system, curve.path, value).period, curve.sizes.dtype)
 
-    jacobian, (end, events, good) = jax.jacfwd(flow, has_aux=True)(jnp.append(x, value))
-    return end, jacobian, events, good
+    now, change = jax.jvp(period, (value,), (jnp.ones_like(value),))
+    return now / period(reference), change / period(reference)
 
 
 def bases(curve: OrbitCurve, spot: Any, touches: list[Touch]) -> list[Base]:
@@ -156,10 +158,8 @@ def frame(curve: OrbitCurve, spot: Any, base: Base) -> np.ndarray:
     n = len(curve.sizes)
     if not curve.autonomous:
         return np.eye(n)
-    model = curve.model.with_parameter(curve.path, jnp.asarray(spot.look.parameter))
-    part = np.zeros(len(base.mode), np.int32)
-    state = curve.state(jnp.asarray(base.mode), jnp.asarray(part))
-    f = np.asarray(jfu.ravel_pytree(model.flow(jnp.asarray(base.t), curve.unravel(jnp.asarray(base.x)), state))[0])
+    at = spot.look.parameter, np.asarray(base.t), base.x, base.mode, np.zeros(len(base.mode), np.int32)
+    f = np.asarray(field_at(curve, *at))
     f = f / np.asarray(curve.sizes)
     return np.linalg.svd(f[None])[2][1:].T
 

@@ -1,0 +1,69 @@
+"""The flow map with its derivatives, as one program for all that Python follows solutions for.
+
+The search for an orbit, the return map at a corner and the way to where a solution settles are many calls of it with
+other numbers. The directions in which it is differentiated are numbers too, so that derivatives by the state, by the
+time and by any parameter are no programs of their own.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._numerics._compile import interactive
+from .._types import Scalar, Y
+from ..flow._integrator import Integrator
+from ..flow._solution import Solution
+from ..flow._solve import integrate
+from ..system._system import System
+
+
+class Directions(NamedTuple):
+    """In which directions the state at the end is differentiated: of the start's time and state, of the end's time, and
+    of the model's parameters. Leaves have a leading axis, one entry for each direction."""
+
+    t0: Array
+    t1: Array
+    y0: Y
+    system: Any  # the model with its numbers only
+
+    @classmethod
+    def of_state(cls, system: System, t0: Scalar, y0: Y) -> "Directions":
+        """Each component of the state in turn; and last nothing, to be replaced."""
+        x, unravel = jfu.ravel_pytree(jax.tree.map(np.asarray, y0))
+        rows = np.eye(len(x) + 1, len(x), dtype=t0.dtype)
+        leaves = [np.stack(leaf) for leaf in zip(*(jax.tree.leaves(unravel(row)) for row in rows))]
+        none = np.zeros(len(rows), t0.dtype)
+        numbers = eqx.filter(system, eqx.is_inexact_array)
+        still = jax.tree.map(lambda a: np.zeros((len(rows), *a.shape), a.dtype), numbers)
+        return cls(none, none, jax.tree.unflatten(jax.tree.structure(y0), leaves), still)
+
+
+def with_room(integrator: Integrator, dtype: Any) -> Integrator:
+    """The same with room for the events of several periods, as its bound is meant for one; and with tolerances that are
+    numbers of the program."""
+    return integrator._replace(max_events=3 * integrator.max_events).with_arrays(dtype)
+
+
+@interactive
+def flow_map(
+    system: System, t0: Scalar, t1: Scalar, y0: Y, mode: Any, integrator: Integrator, directions: Directions
+) -> tuple[Solution, Float[Array, "directions n"]]:
+    """The solution from t0 to t1, with dense output, and the derivatives of the state at its end. Nothing else of the
+    solution has derivatives."""
+    numbers, rest = eqx.partition(system, eqx.is_inexact_array)
+
+    def flow(t0: Scalar, t1: Scalar, y0: Y, numbers: Any) -> tuple[Array, Solution]:
+        saveat, model = dfx.SaveAt(dense=True), eqx.combine(numbers, rest)
+        sol = integrate(model, t0, t1, y0, integrator, mode=mode, saveat=saveat, still=True)
+        return jfu.ravel_pytree(sol.y1)[0], sol
+
+    def along(direction: Directions) -> tuple[Array, Array, Solution]:
+        return jax.jvp(flow, (t0, t1, y0, numbers), tuple(direction), has_aux=True)
+
+    _, tangents, sol = jax.vmap(along, out_axes=(None, 0, None))(directions)
+    return sol, tangents
