@@ -5,24 +5,22 @@ import pathlib
 import re
 from typing import Any, NamedTuple
 
-import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from branches import continue_orbit, orbit_of
 from jax import Array
-from models import Duffing, Motion, pid, Support
+from models import Duffing, Motion, Support
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq, fsolve
 
 import nsjax
-from nsjax import continue_bifurcation, continue_orbit, find_orbit, gallery
+from nsjax import continue_bifurcation, gallery
 
 
 def branch_of(system, y0, parameter, interval, orbit=None, **options):
-    method = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-12), max_steps=8192, max_events=16)
-    found = find_orbit(system, y0, **(method | (orbit or {})))
-    return continue_orbit(system, found, parameter, interval, **options)
+    return continue_orbit(system, orbit_of(system, y0, **(orbit or {})), parameter, interval, **options)
 
 
 def of_kind(branch, kind):

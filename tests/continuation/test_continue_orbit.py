@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from branches import orbit_of, same_multipliers, stability_agrees, the
+from branches import continue_orbit, orbit_of, same_multipliers, stability_agrees, the
 from models import Motion, Stop
 
 import nsjax
-from nsjax import continue_orbit, gallery
+from nsjax import gallery
 
 
 POINTS = branch_reference.POINTS

@@ -73,7 +73,7 @@ def grown(system, orbit, parameter, interval, **options):
 def belt():
     """Section 6.7, through the fold beyond which orbits are infinitely unstable."""
     system = gallery.StickSlip(c=0.1, v_dr=0.5)
-    orbit = find_orbit(system, Motion(2.0, 0.0), period=8.0, **METHOD, max_events=16)
+    orbit = find_orbit(system, Motion(2.0, 0.0), period=8.0)
     what, options = (system, orbit, "v_dr", (0.45, 1.3)), dict(record={"stick": sticking, "ends": ends})
     return what, options, *grown(*what, **options)
 

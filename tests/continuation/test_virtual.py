@@ -1,12 +1,12 @@
 """Virtual branches: what the segments of an orbit do beyond a corner at which they are no orbit any more."""
 
-import diffrax as dfx
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from models import Motion, pid
+from branches import continue_orbit, orbit_of
+from models import Motion
 
-from nsjax import continue_orbit, find_orbit, gallery, OrbitBranch, plot
+from nsjax import gallery, OrbitBranch, plot
 
 
 def amplitude(omega):
@@ -20,8 +20,7 @@ def trilinear():
     omega = 0.88
     x = 0.2 / (1 - omega**2 + 0.05j * omega)
     system = gallery.Trilinear(omega=omega)
-    method = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-12), max_steps=8192, max_events=16)
-    orbit = find_orbit(system, Motion(x.imag, x.real * omega), **method)
+    orbit = orbit_of(system, Motion(x.imag, x.real * omega))
     return continue_orbit(system, orbit, "omega", (0.87, 0.92), virtual=True, max_step=0.1)
 
 

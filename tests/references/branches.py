@@ -14,9 +14,15 @@ from nsjax import find_orbit, gallery, OrbitBranch
 from nsjax.continuation import OrbitBifurcation
 
 
+QUICK = dict(solver=dfx.Tsit5())  # of half the size of the default; the search and the continuation share its program
+
+
 def orbit_of(system, y0, **options):
-    method = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-12), max_steps=8192, max_events=16)
-    return find_orbit(system, y0, **(method | options))
+    return find_orbit(system, y0, **(QUICK | options))
+
+
+def continue_orbit(*args, **options):
+    return nsjax.continue_orbit(*args, **(QUICK | options))
 
 
 def the(branch, value, tolerance=1e-8):
