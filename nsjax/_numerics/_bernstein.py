@@ -203,6 +203,8 @@ def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar
         _, _, _, free, sure, over = state
         return ~over & (free | ~sure)
 
+    # No stack of intervals, which in a batch would have room for the deepest lane: two integers tell which interval is
+    # next, and its coefficients are made from those of the whole step, so that rounding does not add up over levels.
     def walk(state: tuple) -> tuple:
         level, index, _, free, _, _ = state
         # Past an interval without a root: the next one, at the coarsest level that starts there.

@@ -55,6 +55,8 @@ def _impl(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr) -> list[Any]:
 def _gathered(pred: Any, inputs: list, axes: list, default: list, branch: Callable[..., Any]) -> list[Any]:
     """Runs the branch for the lanes where `pred` holds, group by group."""
     lanes = pred.shape[0]
+    # All lanes with work in one group would be an array whose length is not known; groups of one lane a loop as long as
+    # their number. An eighth of all lanes makes eight turns where every lane has work, and one where few do.
     group = min(max(_GROUP, lanes // 8), lanes)
     # The lanes with work, in order, and then `lanes`, which is dropped.
     rank = jnp.cumsum(pred.astype(jnp.int32))

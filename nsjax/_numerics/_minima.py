@@ -109,6 +109,8 @@ def minima(
         low, most = jnp.min(whole, axis=0), jnp.maximum(walk.minima.most, jnp.max(whole, axis=0))
         seen = jnp.minimum(walk.seen, low)
         allowed = RESOLVED * jnp.max(jnp.abs(whole), axis=0) + slack
+        # What stays higher than what is known need not be resolved: a guard that is sharp far from zero would halve
+        # piece after piece. (Divided by its zeros it is another function, which this bound says nothing of.)
         undivided = (orders[0] == 0) & (orders[1] == 0)
         too_high = undivided & (low - MARGIN * missed > seen)
         rough = jnp.any((missed > allowed) & ~too_high) & (walk.width > SHORTEST)
@@ -139,8 +141,8 @@ def minima(
         x_next = jnp.where(rough, walk.x, xs[-1])
         return _Walk(begin, jnp.minimum(width, 1 - begin), x_next, seen, found)
 
-    # (One that is not a number is not rough: it ends. Of a condition on one number XLA would look for a count of the
-    # turns, which takes long.)
+    # (A function that is NaN counts as resolved, so that the walk ends. The second condition follows from the first:
+    # of a loop whose condition depends on one number alone, XLA would look for a count of the turns, which takes long.)
     return lax.while_loop(lambda walk: (walk.begin < 1) & (walk.width > 0), step, start).minima
 
 

@@ -40,6 +40,8 @@ def _triangular(factors: Float[Array, "factors n n"]) -> Float[Array, "n n"]:
         after, r = _qr(a @ q)
         return after, (q, r)
 
+    # Shifts would turn faster, but each lane would deflate at another place: so a fixed number of turns, one loop for a
+    # batch. To derivatives the q are constants: the matrix is similar to the product whatever they are.
     frozen = lax.stop_gradient(factors)
     q = lax.fori_loop(
         0, LAPS, lambda _, q: lax.scan(turn, q, frozen)[0], jnp.eye(factors.shape[-1], dtype=factors.dtype)

@@ -129,6 +129,12 @@ def _unless_rounding(x: Array, blur: Array) -> Array:
 
 
 def _matrix(model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Float[Array, "n n"]:
+    """S = DR - f⁺ Dρ + (f⁺ (1 + Dρ f⁻ + ρ_t) - DR f⁻ - R_t) nᵀ / (nᵀ f⁻ + h_t): (3.32) for an event that takes the time
+    ρ, as impacts do that lead to rest. Then P S, with the linearised projection P onto the contact.
+
+    A perturbation δ before the event moves its time by dt = -nᵀδ / (nᵀf⁻ + h_t), the state after it by
+    DR (δ + f⁻ dt) + R_t dt, and the time from which that goes on with f⁺ by dt + Dρ (δ + f⁻ dt) + ρ_t dt.
+    """
     j = _jump(model, t, y, k, before, after)
     late = 1 + j.drest @ j.f_before + j.rest_t  # how much later the state of rest begins when the impact does
     blur = jnp.abs(j.dr) @ j.blur[0] + jnp.abs(late) * j.blur[1] + _part(j.r_t)
@@ -151,8 +157,8 @@ def saltation_matrix(
 
     S = DR + (f⁺ - DR f⁻ - R_t) nᵀ / (nᵀ f⁻ + h_t), with n = grad h: eq. (3.30) where the state does not jump (R = y)
     and h does not depend on time, (3.32) where it does. At a tangency the denominator vanishes, and the entries that
-    depend on it are infinite. For
-    an impact into resting contact R sums all impacts up to the accumulation point, whose time varies with the state.
+    depend on it are infinite. For an impact into resting contact R sums all impacts up to the accumulation point, whose
+    time varies with the state.
 
     **Arguments:**
 

@@ -126,9 +126,9 @@ class Flow(eqx.Module):
             low = self.survey(step.guards, known)
             is_finite, quiet = low == low, low > 0
             result = RESULTS.where(keep & ~is_finite, RESULTS.nonfinite_field, result)
-            # A guard that is no polynomial to the precision needed is not trusted: a shorter step is. (At most so
-            # often: one with a kink never is.)
-            # Nor is a step so short that rounding of time alone spoils the polynomial.
+            # Why a step is halved: the polynomial of a guard does not stand for it to the precision needed, and roots
+            # found on it would mean nothing. Not for ever: a guard with a kink is never a polynomial, and on a step so
+            # short that rounding of time spoils it no guard is.
             eps = float(jnp.finfo(c.t.dtype).eps)
             floor = 4 * eps / unresolved(c.t.dtype) * jnp.maximum(jnp.abs(c.t), self.t1 - self.t0)
             poor = ~step.resolved | _backward(step, known)
@@ -274,6 +274,8 @@ class Flow(eqx.Module):
             events = events + news.astype(jnp.int32)
             halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(step.keep, 0, halted))
             result = RESULTS.where(event & (result == RESULTS.successful), there.result, result)
+            # Several events at one instant need not be chatter: an impact sets in motion what rested, which lets go of
+            # something else. But each switch changes a few times only.
             result = RESULTS.where(halted > 8 + 4 * len(model.switches), RESULTS.stuck_in_events, result)
         accepted = c.accepted + moved.astype(jnp.int32)
 

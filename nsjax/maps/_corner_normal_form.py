@@ -263,6 +263,8 @@ def _solved(corner: CornerMap, words: np.ndarray, rtol: float) -> tuple[np.ndarr
     Claims t are g without an event, -g with one, and the duration where a square root is taken: they must all have the
     sign of ν. All points are solved for at once: the product of the maps would lose what contracts to what expands.
     """
+    # Linear equations for each itinerary, instead of iterating the map, which would find what is stable only. The signs
+    # of t tell whether the itinerary is admissible, for ν > 0 and for ν < 0 by one solution.
     a, b, e, n, c, square = corner
     (count, length), (places, size) = words.shape, b.shape
     unit = size + 1  # unknowns of a place: x, then t

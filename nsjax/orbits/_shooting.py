@@ -51,7 +51,8 @@ class Shooting(NamedTuple):
         return search(self, system, t0, y0, jnp.asarray(period, t0.dtype), mode)
 
     def period(self, x: Array, z: Array, system: System) -> Scalar:
-        """From the unknowns z, which begin with the state x."""
+        """From the unknowns z, which begin with the state x. (The logarithm of the period is unknown: Newton's method
+        cannot step to a period below zero.)"""
         return jnp.exp(z[-1]) if system.period is None else jnp.asarray(system.period, x.dtype) * self.order
 
     @property
@@ -140,6 +141,7 @@ def _search(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scala
     """The search, step by step."""
     unsure, base, integrator = np.zeros((), bool), (y0, period, mode), with_room(shooting.integrator, t0.dtype)
     directions = Directions.of_state(system, t0, y0)
+    # Last the direction of the end's time, for Newton's method in the period.
     directions = directions._replace(t1=np.eye(len(directions.t1), dtype=t0.dtype)[-1])
 
     def look(z: Array, laps: float, converged: Any, **how: bool) -> _Trial:

@@ -31,7 +31,8 @@ _IDLE = {"max": -np.inf, "min": np.inf}  # bounds that are none
 _SMOOTH = ("hypot", "logaddexp", "logaddexp2")  # functions of JAX that are smooth, but written with kinks
 _MOST = 4  # kinks in which the field is not affine: it is evaluated for each combination of their signs
 
-# What evaluates a program yields the kind and h of each kink, and is sent the value of its switch, or None to leave it.
+# One evaluation serves to list kinks, to give the h of one of them (it goes no further), and to put switch values in.
+# So it is a generator: it yields the kind and h of each kink, and is sent the value of its switch, or None to leave it.
 _Walk = Generator[tuple[str, Array], Array | None, Any]
 
 

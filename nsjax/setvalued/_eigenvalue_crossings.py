@@ -186,6 +186,8 @@ def _gaps(values: np.ndarray) -> np.ndarray:
 def _matched(before: np.ndarray, moves: np.ndarray, after: np.ndarray, extent: float) -> tuple[np.ndarray, bool]:
     """Which eigenvalue after continues which before, that is expected to have moved by so much; and whether that is
     beyond doubt, or too small to be seen."""
+    # Nearest first, not the best assignment of all: where the two differ the match is in doubt, and the caller halves
+    # the step. Near a collision derivatives grow without bounds, and the moves that they foretell are left out.
     left = np.abs(np.where(np.abs(moves) < 0.1 * extent, before + moves, before)[:, None] - after)
     order, missed = np.zeros(len(after), int), np.zeros(len(after))
     for _ in range(len(after)):

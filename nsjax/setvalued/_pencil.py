@@ -175,6 +175,8 @@ class Pencil:
 
     def _refined(self, q: float, point: complex | None, weight: int, reach: float) -> float:
         """Newton's method on the eigenvalue, if it is simple: to where it is on the axis, or where it touches it."""
+        # The eigenvalue has more digits than the root of a determinant. Not where several meet: their derivatives are
+        # infinite there, and the mean of the roots is better.
         for _ in range(0 if self.stays else 3):  # one that stays there has no such place
             s = self.at(q)
             i = int(np.argmin(self._away(q, point)))
@@ -200,6 +202,8 @@ class Pencil:
 
     def _complete(self, groups: list[list[_Candidate]]) -> list[list[_Candidate]]:
         """Between two roots nothing changes. Where rounding lost one and something does, bisection finds it."""
+        # The matrices for pairs have n (n - 1) / 2 rows and are worse conditioned than A + q B: a root of theirs may
+        # leave the real axis by more than `NEARLY_REAL`. How many eigenvalues are unstable does not depend on them.
         for _ in range(4 * len(self.a) ** 2):
             places = [-BEYOND, *(g[0].q for g in groups), 1 + BEYOND]
             lost = None

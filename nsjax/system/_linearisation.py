@@ -43,6 +43,8 @@ def linearise(
 
     The derivatives by few values are worked out one by one, so that what is zero is left out; by many as a batch.
     """
+    # The multipliers, the field for them, and the projection onto the surfaces need the same derivatives, and share
+    # this result: worked out for each of them anew they made larger programs.
     leaves, tree = jax.tree.flatten(y)
     if len(values) > WRITTEN_OUT:
         at, pulls = jax.vmap(lambda *d: jax.jvp(field, values, d), out_axes=(None, 0))(

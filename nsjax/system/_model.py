@@ -265,8 +265,8 @@ class SwitchedSystem(Clocked):
         if self.jointly_affine:
             move, near = moves(s)
             return after(s, move), near.pulled(near.field, move)
-        # Newton's method for a multi-affine field. Friction proportional to a contact force has no say where that is
-        # zero: the search sets out from another value.
+        # Newton's method for a multi-affine field, in a fixed number of steps: such a loop can be transposed. Friction
+        # proportional to a contact force has no effect where that is zero: the search sets out from another value.
         begin = [jnp.where(h, 1, s[k]) if k in self.contacts else s[k] for k, h in zip(which, held)]
         s = lax.fori_loop(0, 6, lambda _, s: after(s, moves(s)[0]), put(s, which, begin))
         return s, self.field(t, y, s)

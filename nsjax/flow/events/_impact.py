@@ -54,6 +54,8 @@ def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) ->
         else:
             want = jnp.stack([-(1 + e) * rates[0]] + [-r for r in rates[1:]])
             matrix = jnp.stack([jnp.stack(g) for g in gains], axis=1)
+            # Contacts can only push: a linear complementarity problem. What would pull is let go and not taken back, so
+            # that there are no more rounds than contacts, a number that is known when the program is made.
             held = takes_part
             for _ in which[1:]:
                 square = jnp.where(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))

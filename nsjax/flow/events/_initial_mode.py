@@ -131,7 +131,8 @@ class _Start:
     def refuse_wrong_modes(self) -> None:
         model, t, y, state = self.model, self.t, self.y, self.state()
         for k, gap in self.beyond.items():
-            # Near zero the rounding of h itself is nothing beside that of the terms which once led there.
+            # Near the origin h has no rounding of its own, but a state that an earlier event left there has that of the
+            # event's time. So the measure is how soon the surface is crossed, not how large h is.
             soon = AT_ONCE * float(jnp.finfo(t.dtype).eps) ** 0.5 * self.horizon
             off = gap > soon * jnp.abs(frozen(model.approach(k, t, y, state)))
             contact = isinstance(model.switches[k], impact)
@@ -140,6 +141,8 @@ class _Start:
 
     def roots_there(self, state: ModeState) -> list[Any]:
         """Guards of surfaces on which the start lies have a root there already."""
+        # Without this the first step would find the start itself as an event. A root is simple where the field crosses
+        # the surface and double where it is tangent; more than two cannot be told apart.
         model, t, y, roots = self.model, self.t, self.y, list(state.roots)
         f = model.flow(t, y, state)
         for k, value in enumerate(frozen(model.values(t, y, state))):

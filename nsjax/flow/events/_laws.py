@@ -117,7 +117,10 @@ class Verdict(NamedTuple):
 
 
 def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Verdict:
-    """An assignment, one entry of `row` for each switch that may be at its surface."""
+    """An assignment, one entry of `row` for each switch that may be at its surface: whether each law is kept, by the
+    multipliers of the assignment as a whole, (2.19)-(2.20), with |λ| <= b in place of |λ| <= 1 (Fig. 2.5 (c))."""
+    # Every comparison leaves out what rounding makes of it. One law made too strict leaves no assignment, which is told
+    # as an ambiguous event; made too loose it lets an event follow at the same instant that undoes this one.
     model, t, which, at, came, leaves = here.model, here.t, here.which, here.at, here.came, here.leaves
     yes, rank = jnp.ones((), bool), jnp.zeros((), jnp.int32)
     mode = dict(trial)
@@ -141,10 +144,13 @@ def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Ver
             # With b = 1 dh/dt is zero too where λ reaches it, as far as it does.
             forced = (row[i] == here.side(k, slopes[k])) & (opening >= -1e-6 * jnp.abs(slopes[k]))
             bound = model.bound(k)
+            # With |λ| = b both are right, to hold and to let go. What came from the side to which it would be let go
+            # stays there: held, it would be let go again at the same instant.
             left = (came[k] != 0) & (s[k] * came[k].astype(t.dtype) >= (1 - nearly(t)) * bound)
             sticks = (jnp.abs(s[k]) <= (1 + nearly(t)) * bound) & (leaves[k] == 0) & ~left
             law = jnp.where(held, sticks, jnp.where(leaves[k] == 0, goes, forced))
             strict = law & (held | (leaves[k] != 0) | (opening > small))
+            # Repulsion is no law, but a preference: a surface that repels may hold what has been on it so far, (2.25).
             repels = (slopes[k] >= 0) & (came[k] != 0) & ~here.grips(k, s[k])
             repelled = repelled | (at[k] & held & repels)
         else:
@@ -155,6 +161,8 @@ def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Ver
         valid = valid & (~at[k] | (row[i] == came[k] if k in (here.given or ()) else law))
         sound, clear = sound & (~at[k] | law), clear & (~at[k] | strict)
         kept = held & (model.held(k, came[k]) if k in model.holdable else False)
+        # Powers of five: of up to four switches, no number of lesser preferences outweighs a greater one. To hold is
+        # preferred because friction does so while it can; of several that hold as many, the one that goes on as before.
         for weight, better in ((25, held), (5, kept), (1, crosses)):
             rank = rank + jnp.where(at[k] & better, weight, 0)
     for (i, j), (same, ratio) in here.pairs.items():

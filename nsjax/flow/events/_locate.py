@@ -80,8 +80,7 @@ def _arrival_jvp(primals: Any, tangents: Any) -> tuple[tuple[Scalar, Y], tuple[S
 
 
 def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
-    """The earliest event of a step. Without one, what is told is of the guard that comes nearest to zero and rises
-    again.
+    """The earliest event of a step; without one, the guard that comes nearest to zero and rises again.
 
     The root on the dense output is only where to look: the step is taken again to it, and one Newton step with the true
     field corrects the time, and with it the order of events closer than the dense output can tell. The state follows by
@@ -89,7 +88,7 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
     """
     t, t_next, y, f0, state, polynomials, noise = step
     known = model.stacked(model.known_roots(state), 0)
-    # In the same search where each guard is least: what comes near to zero, and does not meet it, is told.
+    # The same search finds where each guard is least, for `Solution.margin`: a second one would double its cost.
     single = jnp.asarray([slot.switch not in model.clocks and model.parts[slot.switch] == 1 for slot in model.slots])
     first = jnp.arange(known.shape[1]) == 0
     lows = [jnp.where(first, x, -1.0) for x in falls(polynomials)]
@@ -126,15 +125,18 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
     value = jnp.take_along_axis(values, part[:, None], axis=-1)[:, 0]
     rate = jnp.take_along_axis(rates, part[:, None], axis=-1)[:, 0]
     shift = -value / jnp.where(rate == 0, 1, rate)
-    # Where no root was found too the arithmetic must be of numbers: going backwards zero times that is not none.
+    # Finite where no root was found, too: in reverse mode what is not used is multiplied by zero, and inf - inf is NaN.
     plain = jnp.where(found, root - earliest, 0) * length
+    # The dense output is nearly right: a Newton step that rises, or is long, belongs to a tangency or to another root,
+    # and the root of the polynomial stands. So does a root more than 1e-4 of the step after the first one, where the
+    # field at the first one says little.
     trusted = (rate < 0) & (jnp.abs(shift) <= 1e-2 * length) & (plain <= 1e-4 * length)
     shift = jnp.where(trusted, shift, plain)
     # Of events at one instant the first in the order of declaration: as long as no guard has fallen below its rounding.
     blur = jnp.take_along_axis(noise, part[:, None], axis=-1)[:, 0] / jnp.where(rate == 0, 1, jnp.abs(rate))
     latest = jnp.min(jnp.where(found, shift + jnp.where(trusted, blur, 0), jnp.inf))
     slot = jnp.where(met, jnp.argmax(found & (shift <= latest)), nearest).astype(jnp.int32)
-    # The dense output tells how near that comes; without an event the step leads to the nearest of them itself.
+    # The dense output tells how near each comes; without an event the step was taken again to the nearest of them.
     missed = jnp.where(~met & (jnp.arange(len(dips)) == nearest) & (dips < jnp.inf), value, dips)
     if model.clocks:  # at a tick a guard may jump away from zero as it comes to it
         ticks = met & jnp.asarray([k in model.clocks for k, _, _ in model.slots])[slot]

@@ -80,6 +80,9 @@ def transition(
     if event.ticks is not None:
         cosine = jnp.where(event.ticks, 1, cosine)
         missed = jnp.minimum(missed, jnp.where(event.ticks, event.jumped_to(state, after), jnp.inf))
+    # At a cosine c an error δ of h changes c by about δ/c, and the saltation matrix, which grows as 1/c, by δ/c² of
+    # itself. With δ = eps that is as much as c where c is the cube root of eps. A short flight ends with a small cosine
+    # as well, but there h has no minimum, and the derivatives are right.
     rows = [a[slot, part[slot]] for a in step.polynomials]
     bends = bend(rows, (t - step.t) / jnp.where(halted, 1, step.t_next - step.t)) > 0
     grazes = event.found & news & ~halted & bends & (cosine < jnp.cbrt(jnp.finfo(t.dtype).eps))
@@ -119,7 +122,8 @@ class _Event:
         self.ticks = jnp.asarray([s.switch in model.clocks for s in model.slots])[self.slot] if model.clocks else None
         if self.ticks is not None:  # to the last digit
             self.t = self.t + lax.stop_gradient(jnp.where(self.ticks, model.next_tick(state.mode) - self.t, 0))
-        # What leaves a surface must do so from there, and not from beside it.
+        # What leaves a surface must do so from there: from beside it, at a loose tolerance, it met the surface again at
+        # once, and chattered.
         self.before = model.project(self.t, before, state) if model.holdable else before
         self.halted = self.t <= step.t
         self.parts, self.modes = list(state.part), list(state.mode)
@@ -204,6 +208,8 @@ class _Event:
 
     def come_to_rest(self) -> None:
         """Whether an impact ends in a state of rest, with all the ever shorter flights that would follow it."""
+        # The geometric series is exact for a constant force. What the force changes within a flight of √eps of the time
+        # passed moves the state by some eps; flights on from there would cost an event each, and have no digits left.
         model, t, state, jumped = self.model, self.t, self.mode_state(), self.after
         eps = jnp.finfo(t.dtype).eps
         brief = jnp.maximum(jnp.sqrt(eps) * (t - self.begin), 1e4 * eps * jnp.abs(t))

@@ -178,6 +178,8 @@ class TaylorStepper(Stepper):
         inverse = None
         if which:
             held = row([model.held(k, state.mode[k]) for k in which])
+            # In every order the unknown coefficient of λ is multiplied by the matrix at the start alone: one inverse
+            # serves for all orders, where solving anew would take as many linear systems as there are terms.
             slope, units = model.linearised(t, y, state, s).slope, row(jnp.eye(len(which), dtype=t.dtype))
             inverse = jnp.stack(list(jax.vmap(model.multipliers, in_axes=(None, 0, None))(slope, units, held)))
             inverse = inverse if isinstance(units, list) else inverse.T
