@@ -174,7 +174,7 @@ def _number_arcs(ax: Any, branch: OrbitBranch, diagram: Diagram, names: Callable
 def _arcs(branch: OrbitBranch, names: Callable[[OrbitBifurcation], str]) -> Iterator[tuple[Arc, int, int]]:
     """The stretches of a branch between its special points: with their first point, and that after their last."""
     inner = list(map(names, branch.special))
-    # Where a closed branch was begun is no end.
+    # A closed branch does not end where it was begun.
     ends = [inner[-1], *inner, inner[0]] if inner and CLOSED in branch.ends else ["", *inner, ""]
     cuts = [0, *branch.indices, len(branch)]
     for k, (start, stop) in enumerate(zip(cuts, cuts[1:])):
@@ -199,7 +199,7 @@ def _circles(corners: list[OrbitBifurcation], diagram: Diagram, labels: dict[Any
     columns = min(len(corners), 3)
     rows = -(-len(corners) // columns)
     drawn = figure(4.2 * columns, 0.6 + 4.2 * rows)
-    drawn.set_layout_engine("compressed")  # as the axes have equal units
+    drawn.set_layout_engine("compressed")  # because the axes have equal units
     axes = drawn.subplots(rows, columns, squeeze=False).ravel()
     for ax in axes[len(corners) :]:
         ax.remove()

@@ -1,6 +1,6 @@
 """The least values that functions take along a smooth path, wherever and however often they turn.
 
-The path is gone along in pieces, each so short that the polynomials through its Chebyshev points stand for all
+The path is followed in pieces, each so short that the polynomials through its Chebyshev points stand for all
 functions: the last coefficients of their Chebyshev series tell. Where one is not resolved the piece is halved, unless
 it cannot be as low there as elsewhere. Of a polynomial every dip that may be the lowest is followed to its bottom.
 """
@@ -24,7 +24,7 @@ THETA = 0.5 - 0.5 * np.cos(np.pi * np.arange(NODES + 1) / NODES)
 _moments = [0.0 if k % 2 else 1 / (1 - k**2) for k in range(NODES + 1)]
 WEIGHTS = np.linalg.solve(np.polynomial.chebyshev.chebvander(2 * THETA - 1, NODES).T, _moments)
 
-RESOLVED = 1e-9  # of its largest value, or of what is told, the part of a function that its polynomial may miss
+RESOLVED = 1e-9  # the part of its largest value by which a polynomial may miss a function
 MARGIN = 8.0  # an unresolved function is lower than at its nodes by at most this many times what may be missed
 CALM = 1e-2  # of what may be missed: after a piece that misses less the next is twice as long
 SHORTEST = 2.0**-14  # of the path: a kink is not resolved by any polynomial

@@ -166,8 +166,8 @@ class Series:
         terms.extend([None] * (k + 1 - len(terms)))
         terms[k] = x
 
-    # Of max, abs and the like the series is that of the side on which the first coefficients are. It knows nothing of a
-    # kink ahead: whoever sums it looks at what it misses at its end (`_error` of the Taylor steps).
+    # Of max, abs and the like the series is that of the side on which the first coefficients are. It says nothing of a
+    # kink ahead: `_error` of the Taylor steps looks for one at the end of a step.
     def equation(self, k: int, e: Any, operands: list[int], results: list[int]) -> list[Coefficient]:
         name, bind = e.primitive.name, ft.partial(e.primitive.bind, **e.params)
         if k == 0 or not any(self.varies(i) for i in operands):

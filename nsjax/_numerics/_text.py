@@ -39,7 +39,7 @@ def shown(cls: type[T]) -> type[T]:
 
 
 def known(tree: Any) -> bool:
-    """Whether all numbers are, as they are not under `jit`, `vmap` or differentiation."""
+    """Whether all numbers have values, which they do not under `jit`, `vmap` or differentiation."""
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
 
 
@@ -88,8 +88,8 @@ def between(x: Any) -> str:
 
 
 def suggesting(hints: dict[str, str]) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorates a public function: an argument that it does not have is told with the one that may be meant, or with
-    the hint for it."""
+    """Decorates a public function: an argument that it does not have raises an error that names the one which may be
+    meant, or gives the hint for it."""
 
     def decorate(fn: Callable[P, R]) -> Callable[P, R]:
         names = list(inspect.signature(fn).parameters)

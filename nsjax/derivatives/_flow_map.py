@@ -1,4 +1,4 @@
-"""The flow map with its derivatives, as one program for all that Python follows solutions for.
+"""The flow map with its derivatives: one program for all purposes for which Python follows solutions.
 
 The search for an orbit, the return map at a corner and the way to where a solution settles are many calls of it with
 other numbers. The directions in which it is differentiated are numbers too, so that derivatives by the state, by the
@@ -44,8 +44,8 @@ class Directions(NamedTuple):
 
 
 def with_room(integrator: Integrator, dtype: Any) -> Integrator:
-    """The same with room for the events of several periods, as its bound is meant for one; and with tolerances that are
-    numbers of the program."""
+    """The same with room for the events of several periods, where its bound is meant for one; and with tolerances that
+    are numbers of the program."""
     return integrator._replace(max_events=3 * integrator.max_events).with_arrays(dtype)
 
 

@@ -124,7 +124,7 @@ def _part(x: Array) -> Array:
 
 
 def _unless_rounding(x: Array, blur: Array) -> Array:
-    """Zero where terms cancel apart from their rounding; the derivative stays, as they need not cancel next to it."""
+    """Zero where terms cancel apart from their rounding; the derivative stays: next to it they need not cancel."""
     return x - lax.stop_gradient(jnp.where(jnp.abs(x) < blur, x, 0))
 
 

@@ -54,8 +54,8 @@ def sensitivity(fn: Callable[[Any], tuple[PyTree, Solution]], x: PyTree, *, reve
     """Value and derivative of a function of a solution, with the itinerary to which they belong.
 
     A gradient is that of one itinerary. Where an optimiser or a Newton iteration walks over a grazing or a corner the
-    next gradient is that of another, and the value may have a jump or a kink in between: who compares the itineraries
-    of two iterates sees it.
+    next gradient is that of another, and the value may have a jump or a kink in between. Comparing the itineraries of
+    two iterates shows it.
 
     **Arguments:**
 

@@ -36,8 +36,7 @@ class Equilibrium(eqx.Module, Generic[StateT]):
         of a contact.
     - `jacobian`: ∂f/∂y in this mode, of the field (2.19) on surfaces that hold it; shape `(n, n)`, for the state
         flattened by `ravel_pytree`.
-    - `eigenvalues`: of what can move, largest real part first: in `n` minus `held` directions, those left out being not
-        numbers.
+    - `eigenvalues`: of what can move, largest real part first: in `n` minus `held` directions; the others are NaN.
     - `held`: how many directions the surfaces take: one each, a contact two.
     - `stable`: whether all eigenvalues have negative real parts, and the surfaces attract.
     - `admissible`: whether it lies where its mode does: on its sides of the surfaces, with |λ| within its bound, a
@@ -103,7 +102,7 @@ def stacked_values(s: tuple[Any, ...], dtype: Any) -> Float[Array, " switches"]:
 
 def balance(model: SwitchedSystem, t: Scalar, y: Y, sigma: Array, state: ModeState) -> Float[Array, " equations"]:
     """What vanishes at an equilibrium: the field; h on the surfaces that hold it, whose values are unknowns beside the
-    state, (2.19)-(2.20); and what the values of the others differ from their signs."""
+    state, (2.19)-(2.20); and by how much the values of the others differ from their signs."""
     rest = model.signs(t, state)
     rows = [
         jnp.where(model.held(k, state.mode[k]), _surface(model, k, t, y, state), sigma[i] - rest[k])

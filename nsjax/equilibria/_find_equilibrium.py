@@ -121,8 +121,8 @@ def checked_equilibrium(system: System, y0: Y, t: Any, mode: Any, tol: float | N
     ticks = any(isinstance(switch, clock) for switch in system.switches)
     if ticks or not is_constant(lambda t: system.vector_field(t, y0, values), t):
         raise ValueError(
-            f"`{type(system).__name__}` has no equilibrium, as time enters its vector field: look for a periodic orbit "
-            "by `find_orbit`, or leave the forcing out of the model."
+            f"`{type(system).__name__}` has no equilibrium, because time enters its vector field: look for a periodic "
+            "orbit by `find_orbit`, or leave the forcing out of the model."
         )
     return system, y0, t, given, (1e-12 if jnp.finfo(t.dtype).eps < 1e-10 else 1e-5) if tol is None else tol
 

@@ -1,4 +1,4 @@
-"""What a failed solution is told as: one line with the cause, the place and the remedy.
+"""What a failed solution is reported as: one line with the cause, the place and the remedy.
 
 Where the numbers are known this is raised in Python, after the compiled program has ended. (An error raised within one
 comes with the stack of the compiler, and may be that of an earlier call.)

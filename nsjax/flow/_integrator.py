@@ -21,7 +21,7 @@ class Integrator(NamedTuple):
     adjoint: dfx.AbstractAdjoint = dfx.ForwardMode()
 
     def checked(self, dtype: Any, tolerance: tuple[float, float] = (1e-8, 1e-5)) -> "Integrator":
-        """The same with a step size controller, and with a solver, as the loop needs them.
+        """The same with a step size controller and a solver in the form that the loop needs.
 
         **Arguments:**
 

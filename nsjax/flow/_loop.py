@@ -181,7 +181,7 @@ class Flow(eqx.Module):
         own = self.stepper.pace(self.controller, frozen(step), t, frozen(c.y), self.t1 - self.t0)
         if own is not None:
             return *own, c.controller, dfx.RESULTS.successful
-        # An error that is not a number is too large.
+        # An error that is NaN counts as too large.
         error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), step.error)
         terms = dfx.ODETerm(lambda t, y, args: model.flow(t, y, c.state))
         # The step size is no function to be differentiated; powers of an error of zero are not even differentiable.
@@ -212,8 +212,8 @@ class Flow(eqx.Module):
         return lax.stop_gradient(found)
 
     def survey(self, guards: list, known: list) -> Scalar:
-        """A lower bound of the guards along the step, leaving out their known roots; not a number if any coefficient is
-        not finite. Where it is positive no guard has a root: one of its parts is positive all along."""
+        """A lower bound of the guards along the step, leaving out their known roots; NaN if any coefficient is not
+        finite. Where it is positive no guard has a root: one of its parts is positive all along."""
         rows = [ft.reduce(jnp.maximum, map(self.stepper.least, row, roots)) for row, roots in zip(guards, known)]
         return once(ft.reduce(jnp.minimum, rows) + 0 * sum(c for row in guards for part in row for c in part))
 
@@ -386,6 +386,6 @@ def _landed(pred: Any, flow: Flow, here: tuple, default: Transition) -> Transiti
         flow, here = eqx.combine(dynamic, static)
         return eqx.filter(flow.land(*here), eqx.is_array)
 
-    if flow.reverse:  # `compact_cond` knows no transposition
+    if flow.reverse:  # `compact_cond` has no rule for transposition
         return eqx.combine(lax.cond(pred, branch, lambda _: dynamic_default, dynamic), static_default)
     return eqx.combine(compact_cond(pred, branch, (dynamic,), dynamic_default), static_default)

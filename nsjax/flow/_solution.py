@@ -166,7 +166,7 @@ class Solution(eqx.Module, Generic[StateT]):
         hold as well as let go (repulsion sliding, chosen by `mode`, example 2.5; static friction that holds with
         |λ| > 1), behind a two-fold (where the surface that it slides on has come to repel), and if it runs backwards
         and slides or rests. That static friction which holds goes on doing so until |λ| = b is its law, no choice; how
-        elements on coinciding surfaces share their load is no matter, since the motion is the same. Where five or more
+        elements on coinciding surfaces share their load does not count: the motion is the same. Where five or more
         switches are at their surfaces, only assignments are looked at that differ in one of them. Derivatives are those
         among solutions of the same choice.
 
@@ -217,7 +217,7 @@ class Solution(eqx.Module, Generic[StateT]):
         return text + near * bool(self.margin < 100) + "\n  not the only solution: see `unique`" * (not self.unique)
 
     def within(self, max_events: int) -> "Solution[StateT]":
-        """The same with room for so many events; one that has more has failed."""
+        """The same with room for `max_events` events; one that has more has failed."""
         events, num = self.events, jnp.minimum(self.events.num, max_events)
         rows = jax.tree.map(lambda x: x[:max_events], eqx.tree_at(lambda e: e.num, events, None))
         full = (events.num > max_events) & is_okay(self.result)

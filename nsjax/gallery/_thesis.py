@@ -309,5 +309,5 @@ def thesis(key: str, **parameters: Any) -> System:
     known = [field.name for field in dataclasses.fields(system())]
     for name in parameters:
         if name not in known:
-            raise ValueError(f"Argument `{name}` must be a parameter of {key!r} ({', '.join(known)}), but is none.")
+            raise ValueError(f"Argument `{name}` must be a parameter of {key!r} ({', '.join(known)}), but is not.")
     return system(**parameters)

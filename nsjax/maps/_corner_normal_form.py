@@ -172,7 +172,7 @@ def find_cycles(corner: CornerMap, most: int = 8, *, symmetry: np.ndarray | None
 def corner_kind(cycles: Cycles) -> CornerKind:
     """Names the bifurcation by the number of cycles on each side.
 
-    A Neimark-Sacker bifurcation changes no number that is seen here: it is "none", or "multiple crossing".
+    A Neimark-Sacker bifurcation does not change the numbers of cycles: it is "none", or "multiple crossing".
 
     **Arguments:**
 

@@ -148,8 +148,8 @@ def section_map(
             )
         if isinstance(found, impact) and direction == -1:
             raise ValueError(
-                f"Argument `direction` must be 1 or 0 for the impact `{section}`, as an iterate is the state after it, "
-                "but got -1."
+                f"Argument `direction` must be 1 or 0 for the impact `{section}`, because an iterate is the state "
+                "after it, but got -1."
             )
     elif callable(section):
         h = jax.eval_shape(section, t, y)
@@ -165,8 +165,8 @@ def section_map(
         )
     if max_time is None and system.period is None:
         raise ValueError(
-            f"Argument `max_time` must be given, as `{owner}` is autonomous and has no time of its own: how long a "
-            "solution may take to return [time]."
+            f"Argument `max_time` must be given, because `{owner}` is autonomous and has no time of its own: how long "
+            "a solution may take to return [time]."
         )
     time = jnp.asarray(system.period, t.dtype) * PERIODS if max_time is None else jnp.asarray(max_time, t.dtype)
     if isinstance(section, str):

@@ -74,8 +74,8 @@ def find_orbit(
     - `period`: autonomous systems: a guess of the period [time]; found by following the solution if None. For forced
         systems it is `order * system.period`, and must not be given.
     - `t0`: time of the base point.
-    - `order`: subharmonic order of a forced orbit; if None, the solution is followed to where it settles, and after
-        how many periods of the forcing (up to 16) it repeats itself there is found out.
+    - `order`: subharmonic order of a forced orbit; if None, the solution is followed to where it settles, and the
+        order is the number of periods of the forcing (up to 16) after which it repeats itself there.
     - `symmetry`: for an orbit with y(t + period/2) = `symmetry`(y(t)), a function of the state, or "inversion" for
         -y (6.24). Shooting takes half the period then, and finds no orbit that is less symmetric.
     - `backward`: whether to shoot in backward time: for an orbit that leaves a surface which repels (section 6.7), or

@@ -61,7 +61,7 @@ def largest(system: System, arcs: Arcs, integrator: Integrator, fn: Callable[[Sc
     for _ in range(REFINEMENTS):
         _, slope, bend = at(still, points, calm, share)
         move = jnp.where(bend < 0, -slope / jnp.where(bend < 0, bend, 1), 0) / jnp.where(length > 0, length, 1)
-        # The polynomials have told where it is.
+        # The polynomials gave its place to within a node.
         share = jnp.clip(share + jnp.clip(move, -1 / NODES, 1 / NODES), 0, 1)
     value, slope, bend = at(flows, x, arcs, frozen(share))
     inside = (share > 0) & (share < 1) & (bend < 0)

@@ -34,10 +34,10 @@ class Orbit(eqx.Module, Generic[StateT]):
     - `period`: its period (`order` times that of the forcing).
     - `events`: the event log of one period.
     - `monodromy`: Φ(t0 + period, t0), shape `(n, n)`, for the state flattened by `ravel_pytree`; infinite where the
-        orbit leaves a surface that repels, as then there is none.
+        orbit leaves a surface that repels, where there is none.
     - `multipliers`: its eigenvalues, the Floquet multipliers, largest modulus first; infinite, one for each time that
         the orbit leaves a surface that repels.
-    - `structural_zeros`: how many of them vanish whatever the parameters, as the orbit slides or rests.
+    - `structural_zeros`: how many of them vanish whatever the parameters, because the orbit slides or rests.
     - `stable`: whether all multipliers lie inside the unit circle, the trivial one of an autonomous system left out.
     - `residual`: the largest component of y(t0 + period) - y0, or of the equations of the segments.
     - `admissible`: whether the orbit keeps to its modes: stays on its sides of the surfaces, with |λ| within its bound

@@ -25,7 +25,7 @@ from .segments._solve import by_segments
 
 
 MORE_PIECES = 16  # in the last try by segments
-MOST_RELAYS = 4  # up to this many within their hysteresis are tried in all modes; more are off unless told
+MOST_RELAYS = 4  # up to this many within their hysteresis are tried in all modes; more are off unless `mode` says so
 
 
 class Search(NamedTuple):
@@ -88,7 +88,7 @@ class Search(NamedTuple):
         return orbit
 
     def _modes(self, system: System, y0: Y) -> Iterator[dict[str, Any]]:
-        """Where nothing is told of relays that are within their hysteresis, all modes in which they may be."""
+        """Where `mode` says nothing of relays that are within their hysteresis, all modes in which they may be."""
         if not self.concrete or self.method == "segments" or self.pieces != 1 or not of_relays(system, system.switches):
             return
         given = self.mode or {}

@@ -26,7 +26,7 @@ from ._guess import held_throughout, of_relays, Relays
 from ._orbit import distance, ravel
 
 
-FAR = 1e9  # longer than anybody waits: bounds on steps and events end the way
+FAR = 1e9  # never reached: bounds on steps and events end the way
 STEPS, EVENTS = 2000, 1000  # after which an autonomous solution counts as settled
 LAPS = 100  # after which a forced one does
 SETTLED = 1e-13  # relative: a lap that moves the state by less changes nothing any more

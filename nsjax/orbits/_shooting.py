@@ -190,7 +190,7 @@ def _tried(
     *,
     by_arcs: bool = False,
 ) -> _Trial:
-    """What is made of the `passage` over so many periods from the unknowns z: the solution, and the derivatives of its
+    """What is made of the `passage` over `laps` periods from the unknowns z: the solution, and the derivatives of its
     end by state and time. The section stands on the guesses of state, period and modes. `by_arcs`: whether the
     monodromy matrix is that of the saltation formula, and not the derivative of the flow."""
     (guess, first, mode), sign, autonomous = base, shooting.sign, system.period is None
@@ -278,7 +278,7 @@ def _described(
 
 
 def _reversed(arcs: Arcs, events: Events, y0: Y, period: Scalar) -> tuple[Arcs, Events]:
-    """The arcs and the events of a solution over one period backwards, as they follow each other forwards."""
+    """The arcs and the events of a solution over one period backwards, in the order of forward time."""
     num = events.num
 
     def back(leaf: Array, count: Array) -> Array:

@@ -83,7 +83,8 @@ def _returns(orbit: Orbit, sol: Solution) -> bool:
 
 
 def _arc_by_arc(orbit: Orbit, sol: Solution) -> Solution:
-    """An orbit that its solution `sol` leaves, as a surface repels or it is violently unstable: along its own arcs."""
+    """An orbit that its solution `sol` leaves, where a surface repels or the orbit is violently unstable: along its own
+    arcs."""
     path = orbit.path(SAMPLES * 4)
     rows = np.flatnonzero(np.asarray(path.t[:, -1] != path.t[:, 0]))
     order = rows[np.argsort(np.asarray(path.t[rows, 0]))]

@@ -35,7 +35,7 @@ def poincare_map(
     """Draws a map of one number into one, with the diagonal and its fixed points on it, where the slope is less than 1
     (filled) and where it is not (hollow); Figs. 6.4, 6.5, 6.16 and 6.23.
 
-    Where the map is not a number the line is interrupted, and where it jumps it is dotted. A jump over the diagonal
+    Where the map is NaN the line is interrupted, and where it jumps it is dotted. A jump over the diagonal
     counts as a fixed point of infinite slope: an orbit that leaves a surface which repels, as in Fig. 6.16, is one.
 
     **Arguments:**

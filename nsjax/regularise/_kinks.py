@@ -27,7 +27,7 @@ from ..system._system import arrays_of, SwitchValues, System
 
 
 _KINKS: dict[str, Callable[..., Any]] = {"abs": jnp.abs, "max": jnp.maximum, "min": jnp.minimum, "clamp": lax.clamp}
-_IDLE = {"max": -np.inf, "min": np.inf}  # bounds that are none
+_IDLE = {"max": -np.inf, "min": np.inf}  # bounds that never act
 _SMOOTH = ("hypot", "logaddexp", "logaddexp2")  # functions of JAX that are smooth, but written with kinks
 _MOST = 4  # kinks in which the field is not affine: it is evaluated for each combination of their signs
 
@@ -83,8 +83,9 @@ def _walk(jaxpr: Any, values: list[Any], seen: dict[Any, Any]) -> _Walk:
             out = [(yield from _kink(name, x, seen))]
         else:
             raise ValueError(
-                f"A kink (abs, maximum, minimum, clip) inside `{name}` cannot be marked, as it may be met any number "
-                "of times. Write the vector field without the loop or branch, or declare the kink as a `sgn` switch."
+                f"A kink (abs, maximum, minimum, clip) inside `{name}` cannot be marked, because it may be met any "
+                "number of times. Write the vector field without the loop or branch, or declare the kink as a `sgn` "
+                "switch."
             )
         env.update(zip(e.outvars, out))
     return [read(v) for v in jaxpr.outvars]

@@ -370,7 +370,7 @@ def banded(system: System, eta: Any, rate: Any = 1.0) -> System:
     sgn(h), which says nothing in the middle of a band: for b = 1 the field would jump where a stick ends.
 
     The field is not stiff, but jumps at the edges of the bands, and nothing locates them. The adaptive step size copes
-    if its tolerance is well below η; else steps leap over the bands, and there is no end to them. The solution differs
+    if its tolerance is well below η; else steps leap over the bands for ever. The solution differs
     from that of `system` by an error of order η, whatever the tolerance. Its derivatives do not converge, as automatic
     differentiation sees nothing of a jump whose instant varies: take them of `system` itself, or `smoothed`. Time must
     run forward.

@@ -184,8 +184,8 @@ def _gaps(values: np.ndarray) -> np.ndarray:
 
 
 def _matched(before: np.ndarray, moves: np.ndarray, after: np.ndarray, extent: float) -> tuple[np.ndarray, bool]:
-    """Which eigenvalue after continues which before, that is expected to have moved by so much; and whether that is
-    beyond doubt, or too small to be seen."""
+    """Which eigenvalue `after` continues which one `before`, that is expected to move by `moves`; and whether that is
+    beyond doubt, or too small to be visible."""
     # Nearest first, not the best assignment of all: where the two differ the match is in doubt, and the caller halves
     # the step. Near a collision derivatives grow without bounds, and the moves that they foretell are left out.
     left = np.abs(np.where(np.abs(moves) < 0.1 * extent, before + moves, before)[:, None] - after)

@@ -19,8 +19,8 @@ class Linearisation(NamedTuple):
     slope: list[Any]  # of each its derivatives by the values, a row
 
     def pulled(self, tree: Y, by: Row) -> Y:
-        """`tree` moved by so much along each of the derivatives. Of the field that is the one for values which differ
-        by so much, if it is affine in them."""
+        """`tree` moved by the numbers `by` along the derivatives. For the field, if it is affine in the values, that is
+        the field for values which differ by these numbers."""
         leaves, structure = jax.tree.flatten(tree)
 
         def moved(x: Any, pull: Any) -> Any:

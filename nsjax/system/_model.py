@@ -145,7 +145,7 @@ class SwitchedSystem(Clocked):
     def edge(self, k: int, value: Scalar, slack: float) -> Int[Array, ""]:
         """The sign of the bound that the value of a held `sgn` switch is at, or 0.
 
-        Running backwards, what is held with |λ| > 1 by static friction is let go where |λ| falls to 1, as there the
+        Running backwards, what is held with |λ| > 1 by static friction is let go where |λ| falls to 1: there the
         field beside the surface turns round (section 6.7). Which side of 1 it came from is remembered by `BEYOND`.
         """
         sign = jnp.sign(value).astype(jnp.int32)
@@ -163,7 +163,7 @@ class SwitchedSystem(Clocked):
         return any(bool(self.held(k, mode[k])) for k in self.holdable)
 
     def level(self, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
-        """What its multiplier keeps at zero: the active component of h; for a contact dh/dt, as forces act on that."""
+        """What its multiplier keeps at zero: the active component of h; for a contact dh/dt, on which forces act."""
         self = self._in(state)
 
         def h(t: Scalar, y: Y) -> Scalar:
@@ -230,7 +230,7 @@ class SwitchedSystem(Clocked):
         each in the direction in which it resists, and so when the sum of their strengths is spent.
         """
         m, zero, one = len(slope), jnp.zeros_like(right[0]), jnp.ones_like(right[0])
-        # A vanishing slope off the surface is no fault; on it the quotient is infinite, and so is found.
+        # Off the surface a slope may vanish, and must not matter; on it the quotient is infinite, and so is noticed.
         units = [row([one if i == j else zero for j in range(m)]) for i in range(m)]
         rows = [
             jax.tree.map(lambda x, h, u, i=i: jnp.where(held[i] & h, x, u), slope[i], held, units[i]) for i in range(m)
@@ -238,7 +238,7 @@ class SwitchedSystem(Clocked):
         right, matrix = jax.tree.map(lambda r, h: jnp.where(h, r, 0), right, held), list(rows)
         for i, j in self.pairs:
             same = held[i] & held[j] & parallel(rows[i], rows[j])
-            # In which direction each of them pushes the surface is told by the row, and each of the two rows will do.
+            # The row tells in which direction each of them pushes the surface, and either of the two rows will do.
             bounds = {i: self.bound(self.holdable[j]), j: -self.bound(self.holdable[i])}
             weights = row([jnp.asarray(bounds.get(n, zero), zero.dtype) for n in range(m)])
             share = jax.tree.map(lambda x, w: jnp.where(x < 0, -w, w), rows[i], weights)

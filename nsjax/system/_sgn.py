@@ -96,9 +96,9 @@ class sgn(AbstractSwitch):
         self._check_guard(system, self.name, self.guard, t, y)
         if not is_affine(along, jnp.zeros_like(t)):
             raise ValueError(
-                f"`{owner}.vector_field` must be affine in `s.{self.name}`, as the sliding field (2.19) is the convex "
-                "combination of the fields on both sides, but it is not. Use it as a factor of a term: not inside a "
-                "function, in a power, in `jnp.where`, or in a denominator. For two different laws write "
+                f"`{owner}.vector_field` must be affine in `s.{self.name}`, because the sliding field (2.19) is the "
+                "convex combination of the fields on both sides, but it is not. Use it as a factor of a term: not "
+                "inside a function, in a power, in `jnp.where`, or in a denominator. For two different laws write "
                 f"`0.5 * (1 + s.{self.name}) * plus + 0.5 * (1 - s.{self.name}) * minus`."
             )
         bound = self.bound(system)
@@ -112,7 +112,7 @@ class sgn(AbstractSwitch):
             return []
         b = jnp.asarray(self.bound(system))
         least = 1 - 64 * float(jnp.finfo(jnp.result_type(b, 0.0)).eps)  # a quotient of equal forces may be rounded
-        return [(".breakaway", "at least 1, as friction at rest is no weaker than in slip", b >= least, b)]
+        return [(".breakaway", "at least 1, because friction at rest is no weaker than in slip", b >= least, b)]
 
 
 if TYPE_CHECKING:

@@ -81,7 +81,7 @@ class AbstractSwitch(abc.ABC):
         return math.inf
 
     def next_mode(self, mode: Int[Array, ""], direction: Any) -> Int[Array, ""]:
-        """Its mode after it has fired, as far as that is told by the mode before."""
+        """Its mode after it has fired, as far as the mode before determines it."""
         return mode
 
     def modes_after(self, direction: int) -> tuple[int, ...]:

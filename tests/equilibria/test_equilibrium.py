@@ -129,7 +129,7 @@ def test_there_is_none():
 
 
 def test_time_enters():
-    with pytest.raises(ValueError, match="`Trilinear` has no equilibrium, as time enters its vector field"):
+    with pytest.raises(ValueError, match="`Trilinear` has no equilibrium, because time enters its vector field"):
         find_equilibrium(gallery.Trilinear(), Motion(0.0, 0.0))
 
 

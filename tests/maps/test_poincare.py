@@ -529,7 +529,7 @@ def test_cobweb():
 
 def test_mistakes_are_told():
     system, y0 = gallery.StickSlip(), Motion(2.5, 0.0)
-    with pytest.raises(ValueError, match="`max_time` must be given, as `StickSlip` is autonomous"):
+    with pytest.raises(ValueError, match="`max_time` must be given, because `StickSlip` is autonomous"):
         poincare_map(system, rest, y0)
     with pytest.raises(ValueError, match="name of a switch of `StickSlip` .`belt`., but got 'wall'"):
         poincare_map(system, "wall", y0, max_time=9.0)

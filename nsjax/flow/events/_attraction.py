@@ -22,7 +22,7 @@ def reach(model: SwitchedSystem, matrix: Float[Array, "m m"]) -> Float[Array, " 
 
 
 def negligible(rate: Scalar, span: Scalar) -> Bool[Array, ""]:
-    """Whether a rate counts as none beside that which switches may add: forces that cancel leave their rounding."""
+    """Whether a rate counts as zero beside that which switches may add: forces that cancel leave their rounding."""
     return jnp.abs(rate) <= float(jnp.finfo(rate.dtype).eps) ** 0.5 * span
 
 
@@ -82,7 +82,7 @@ def _inverse(whole: Float[Array, "m m"], first: Bool[Array, " m"]) -> tuple[Floa
 def escapes(model: SwitchedSystem, t: Scalar, y: Y, state: ModeState) -> Bool[Array, ""]:
     """Whether a solution that slides may leave at any time: a surface repels, and what else holds can go on doing so
     when it is let go to one of its sides. So it is beyond a two-fold, where the fields on both sides have become
-    tangent to the surface (n · f⁺ = n · f⁻ = 0), as M_kk changes its sign there."""
+    tangent to the surface (n · f⁺ = n · f⁻ = 0): M_kk changes its sign there."""
     model, t, y = frozen((model, t, y))
     which = model.holdable
     s = model.values(t, y, state)

@@ -133,7 +133,7 @@ def completed(
     wrong = jnp.any(h < -slack) | (stays & (rise < -jnp.maximum(1e-9 * jnp.abs(speed), least)))
     ratio = jnp.where(speed == 0, 0, -rise / jnp.where(speed == 0, 1, speed))
     rises = rise > least
-    # Rounding of dh/dt, where the force is but rounding too, is no flight.
+    # Where the force is rounding too, rounding of dh/dt makes no flight.
     flight = 2 * (rise - jnp.where(rises, 0, lax.stop_gradient(rise))) / jnp.where(pull < 0, -pull, 1)
     held = stays & ~rises & (jnp.abs(pull) <= blur)  # without any force
     possible = stays & ~wrong & ((pull < 0) | held) & (ratio < 1)

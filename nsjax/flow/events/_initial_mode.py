@@ -50,7 +50,7 @@ def start_mode(
 
 
 class _Start:
-    """The mode in which a solution sets out while it is found out, switch by switch."""
+    """The mode in which a solution sets out, determined switch by switch."""
 
     def __init__(self, model: SwitchedSystem, t: Scalar, y: Y, given: dict[str, Any], horizon: Scalar):
         self.model, self.t, self.y, self.given, self.horizon = model, t, y, given, horizon
@@ -117,8 +117,8 @@ class _Start:
         self.put(mode, part)
 
     def join_surfaces_at_once(self) -> None:
-        """Nearer to a surface than an event can be told from the start is on it: the end of a period there is off by
-        rounding."""
+        """A start so near to a surface that an event there could not be told from the start is on it: the end of a
+        period on the surface is off by rounding."""
         model, t, y, state = self.model, self.t, self.y, self.state()
         for k in model.of_kind(sgn):
             if k not in self.chosen:

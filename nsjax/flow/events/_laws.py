@@ -96,7 +96,7 @@ class Instant(NamedTuple):
         )
 
     def noise(self, s: dict) -> dict[int, Scalar]:
-        """What rounding can make of d²h/dt² of the contacts: a force below it counts as none, and holds."""
+        """What rounding can make of d²h/dt² of the contacts: a force below it counts as zero, and holds."""
         model, t, y, state = self.model, self.t, self.y, self.state
         zero = {k: jnp.zeros((), t.dtype) for k in self.which}
         if not model.contacts:
@@ -119,8 +119,8 @@ class Verdict(NamedTuple):
 def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Verdict:
     """An assignment, one entry of `row` for each switch that may be at its surface: whether each law is kept, by the
     multipliers of the assignment as a whole, (2.19)-(2.20), with |λ| <= b in place of |λ| <= 1 (Fig. 2.5 (c))."""
-    # Every comparison leaves out what rounding makes of it. One law made too strict leaves no assignment, which is told
-    # as an ambiguous event; made too loose it lets an event follow at the same instant that undoes this one.
+    # Every comparison leaves out what rounding makes of it. One law made too strict leaves no assignment, and the event
+    # counts as ambiguous; made too loose it lets an event follow at the same instant that undoes this one.
     model, t, which, at, came, leaves = here.model, here.t, here.which, here.at, here.came, here.leaves
     yes, rank = jnp.ones((), bool), jnp.zeros((), jnp.int32)
     mode = dict(trial)
@@ -139,7 +139,7 @@ def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Ver
             held = row[i] == 0
             small = nearly(t) * jnp.abs(slopes[k])
             opening = rates[k] * row[i].astype(rates[k].dtype)
-            # Who has just left, at this very instant, is at the bound and may have dh/dt = 0.
+            # What has just left, at this very instant, is at the bound and may have dh/dt = 0.
             goes = (opening > small) | ((row[i] == came[k]) & (opening >= -small))
             # With b = 1 dh/dt is zero too where λ reaches it, as far as it does.
             forced = (row[i] == here.side(k, slopes[k])) & (opening >= -1e-6 * jnp.abs(slopes[k]))
@@ -154,7 +154,7 @@ def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Ver
             repels = (slopes[k] >= 0) & (came[k] != 0) & ~here.grips(k, s[k])
             repelled = repelled | (at[k] & held & repels)
         else:
-            turns = (leaves[k] != 0) & (came[k] != 0)  # it cannot but cross
+            turns = (leaves[k] != 0) & (came[k] != 0)  # it can only cross
             unmoved = jnp.where(came[k] == 0, 1, came[k])
             onward = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
             law = strict = row[i] == jnp.where(turns, -came[k], onward)

@@ -277,8 +277,8 @@ class _Event:
         return state._replace(roots=tuple(roots))
 
     def jumped_to(self, state: ModeState, after: Y) -> Float[Array, " slots"]:
-        """The guards after a tick, which may make one of them jump to just above zero; infinite where they do not tell
-        that."""
+        """The guards after a tick, which may make one of them jump to just above zero; infinite where they say nothing
+        of that."""
         later = self.later
         onto = later.stacked(later.guards(self.t, after, state), jnp.inf)[:, 0]
         single = jnp.asarray([not s.holding and later.parts[s.switch] == 1 for s in later.slots])

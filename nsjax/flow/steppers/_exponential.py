@@ -205,8 +205,8 @@ def _sampled(
         z.append(whole @ z[-1])
     moves = scale * jnp.stack(z)[:, : len(x)]
     between = scale * (half @ z[_N // 2])[: len(x)]
-    # What is seen of it: the last coefficients, and a point between the samples (a fast oscillation may hide from
-    # these). Rounding counts for nothing.
+    # What the polynomial misses is judged by its last coefficients, and by a point between the samples, where a fast
+    # oscillation may hide from them. Rounding is left out.
     frozen, eps = lax.stop_gradient(moves), float(jnp.finfo(x.dtype).eps)
     chebyshev = to_chebyshev(_N, even=True)
     halfway = np.polynomial.chebyshev.chebvander([1 / _N], _N)[0] @ chebyshev

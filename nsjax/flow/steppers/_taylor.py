@@ -92,7 +92,7 @@ def _sum(y: Y, ks: list[Y]) -> Y:
 def _error(ks: list[Y], last: Y) -> Y:
     """The last term, and how far the polynomial is from solving the equation at its end.
 
-    A series knows nothing of a kink in the field that lies ahead; `last`, the field at the end times the length of the
+    A series says nothing of a kink in the field that lies ahead; `last`, the field at the end times the length of the
     step, does. Its weight keeps the defect of a smooth solution below the last term.
     """
 
@@ -300,7 +300,7 @@ def _reach(ys: list[list[Coefficient]], rtol: Any, atol: Any) -> Scalar:
         if sizes:
             size = ft.reduce(jnp.maximum, sizes)
             log = jnp.minimum(log, jnp.where(size == 0, jnp.inf, -jnp.log(jnp.where(size == 0, 1, size)) / i))
-    return 0.9 * jnp.exp(jnp.where(jnp.isnan(log), jnp.inf, log))  # a step into what is no number is rejected later
+    return 0.9 * jnp.exp(jnp.where(jnp.isnan(log), jnp.inf, log))  # a step to where the field is NaN is rejected later
 
 
 def _size(c: list[Scalar]) -> Scalar:
