@@ -1,7 +1,6 @@
 """Which system, with which parameters, from which state: reading the words of the command line."""
 
 import dataclasses
-import difflib
 import importlib.util
 import inspect
 import math
@@ -15,6 +14,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from .. import gallery
+from .._numerics._text import nearest
 from .._types import Y
 from ..system._system import System
 
@@ -81,10 +81,9 @@ def unknown(what: str, name: str, known: Iterable[str]) -> UsageError:
 
 
 def _meant(name: str, known: Iterable[str]) -> str:
-    """The nearest of the names, whatever their case, as a question."""
-    plain = {one.lower(): one for one in reversed(list(known))}
-    near = difflib.get_close_matches(name.lower(), plain, n=1)
-    return f" Did you mean {plain[near[0]]!r}?" if near else ""
+    """The name that may be meant, in the quotes of the command line."""
+    near = nearest(name, known)
+    return "" if near is None else f" Did you mean {near!r}?"
 
 
 # The system.
@@ -117,12 +116,12 @@ def _unknown_system(name: str) -> UsageError:
     """Keys may be meant, or what the gallery calls its systems; or a file."""
     if pathlib.Path(f"{name}.py").is_file():
         return UsageError(f"There is no system {name!r}. Did you mean {name}.py?")
-    called = {key.lower(): key for key in gallery.THESIS}
+    called = {key: key for key in gallery.THESIS}
     for key, entry in gallery.THESIS.items():
         for words in (type(entry.system()).__name__, entry.title):
-            called.setdefault(words.lower(), key)
-    near = difflib.get_close_matches(name.lower(), called, n=1)
-    meant = f" Did you mean {called[near[0]]} ({gallery.entry(called[near[0]]).title})?" if near else ""
+            called.setdefault(words, key)
+    near = nearest(name, called)
+    meant = "" if near is None else f" Did you mean {called[near]} ({gallery.entry(called[near]).title})?"
     keys = ", ".join(gallery.THESIS)
     return UsageError(f"There is no system {name!r}.{meant} Possible: {keys}; or a file of yours, model.py:ClassName.")
 

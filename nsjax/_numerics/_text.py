@@ -43,19 +43,30 @@ def known(tree: Any) -> bool:
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
 
 
-def components(y: Y, axes: int = 0) -> list[tuple[str, Any]]:
-    """The numbers of a state with their names; of many states, whose leaves have `ndim` leading axes, arrays."""
-    out = []
-    for path, leaf in jax.tree_util.tree_leaves_with_path(y):
-        name = jax.tree_util.keystr(path, simple=True, separator=".") or "y"
+def components(y: Y, ndim: int = 0) -> dict[str, np.ndarray]:
+    """The scalar components of a state by name.
+
+    **Arguments:**
+
+    - `y`: the state, or an array of states.
+    - `ndim`: how many leading axes its leaves have that are not the state's own, such as one for time.
+
+    **Returns:** a dictionary: `"x"` for a scalar leaf `y.x` or `y["x"]`, `"q[0]"`, `"q[1]"` for a vector. A state that
+    is an array itself is called `y`.
+    """
+    named = {}
+    for path, leaf in jax.tree_util.tree_flatten_with_path(y)[0]:
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        name = f"y.{name}" if name.isdigit() else name or "y"
         leaf = np.asarray(leaf)
-        out += [(name + (str(list(i)) if i else ""), leaf[(..., *i)]) for i in np.ndindex(leaf.shape[axes:])]
-    return out
+        for index in np.ndindex(leaf.shape[ndim:]):
+            named[name + f"[{','.join(map(str, index))}]" * bool(index)] = leaf[(..., *index)]
+    return named
 
 
 def written(y: Y, axes: int = 0, most: int = 8) -> str:
     """`x = 1.5, v = 0.2`; of a long state the beginning; of many, which have leading axes, `x = 1.5 to 2, v = 0.2`."""
-    parts = [f"{name} = {between(x) if axes else format(float(x), '.6g')}" for name, x in components(y, axes)]
+    parts = [f"{name} = {between(x) if axes else format(float(x), '.6g')}" for name, x in components(y, axes).items()]
     return ", ".join(parts[:most] + ["..."] * (len(parts) > most))
 
 
@@ -65,9 +76,16 @@ def listed(values: Any, digits: int = 6, most: int = 8) -> str:
     return ", ".join([f"{x:.{digits}g}" for x in values[:most]] + ["..."] * (len(values) > most)) or "none"
 
 
+def nearest(name: str, names: Iterable[str]) -> str | None:
+    """Which of the names may be meant, whatever their case."""
+    plain = {one.lower(): one for one in reversed(list(names))}
+    near = difflib.get_close_matches(name.lower(), plain, 1, 0.6)
+    return plain[near[0]] if near else None
+
+
 def did_you_mean(name: str, names: Iterable[str]) -> str:
-    near = difflib.get_close_matches(name, list(names), 1, 0.6)
-    return f" Did you mean `{near[0]}`?" if near else ""
+    near = nearest(name, names)
+    return "" if near is None else f" Did you mean `{near}`?"
 
 
 def counted(names: Iterable[str]) -> str:

@@ -14,7 +14,7 @@ from .._numerics._text import components, did_you_mean, known
 from .._types import Scalar, Y
 from ..system._checks import check_direction, check_fields, check_parameters, check_system
 from ..system._system import System
-from ._save import in_order
+from ._save import times_in_order
 
 
 def checked_start(system: System, t: Any, y: Y, mode: Any) -> tuple[Scalar, Y, dict[str, Any]]:
@@ -74,7 +74,7 @@ def check_numbers(system: System, t0: Scalar, t1: Scalar, y0: Y) -> None:
     for name, t in (("t0", t0), ("t1", t1)):
         if not isinstance(t, Tracer) and not np.isfinite(t):
             raise ValueError(f"Argument `{name}` must be finite, but is {float(t)}.")
-    for name, value in components(y0) if known(y0) else []:
+    for name, value in components(y0).items() if known(y0) else ():
         if not np.isfinite(value):
             raise ValueError(f"Argument `y0` must be finite, but its component `{name}` is {float(value)}.")
     check_parameters(system)
@@ -88,7 +88,7 @@ def _check_times(saveat: dfx.SaveAt, t0: Scalar, t1: Scalar) -> None:
     times = np.asarray(ts, t0.dtype)
     if times.ndim != 1:
         raise ValueError(f"Argument `saveat` must have a vector of times `ts`, but its shape is {times.shape}.")
-    if len(times) and not in_order(times, np.asarray(t0), np.asarray(t1)):
+    if len(times) and not times_in_order(times, np.asarray(t0), np.asarray(t1)):
         bad = times[~np.isfinite(times)] if not np.isfinite(times).all() else times[(times - t0) * (times - t1) > 0]
         got = f"{bad[0]}" if len(bad) else "times in another order; sort them, `jnp.sort(ts)`"
         raise ValueError(

@@ -27,7 +27,7 @@ def explain(system: Any, sol: Solution) -> str:
         what = _not_finite(system, sol)
         text = f"{what} at {where}." if what else f"{text[:-1]} next to {where}."
     elif result == RESULTS.dt_min_reached:
-        largest = max(abs(float(value)) for _, value in components(sol.y1))
+        largest = max(abs(float(value)) for value in components(sol.y1).values())
         cause = (
             "the solution grows beyond all bounds there (a finite-time blow-up)"
             if largest > 1e6
@@ -62,12 +62,12 @@ def _pieces(system: Any, t: Any, y: Y, mode: Any) -> list[tuple[str, list[tuple[
     signs = tuple(
         jnp.where(x == 0, 1, x) if switch.order == 1 else x for switch, x in zip(model.switches, model.signs(t, state))
     )
-    return [*out, (f"`{owner}.vector_field`", components(model.field(t, y, signs)))]
+    return [*out, (f"`{owner}.vector_field`", list(components(model.field(t, y, signs)).items()))]
 
 
 def _not_finite(system: Any, sol: Solution) -> str | None:
     """Which function of the model returned a number that is not finite."""
-    for name, value in components(sol.y1):
+    for name, value in components(sol.y1).items():
         if not np.isfinite(value):
             return f"The state ceased to be finite ({name} = {float(value)}: it overflows, or the model returned NaN)"
     for name, values in _pieces(system, sol.t1, sol.y1, sol.mode1):

@@ -35,7 +35,7 @@ class Request(NamedTuple):
         return cls(sub.t0, sub.t1, sub.ts, sub.steps, sub.fn)
 
 
-def in_order(ts: Any, t0: Any, t1: Any) -> Any:
+def times_in_order(ts: Any, t0: Any, t1: Any) -> Any:
     """Whether times can be saved on the way from `t0` to `t1`: they follow one another, and lie between them."""
     forwards, backwards = ts[1:] >= ts[:-1], ts[1:] <= ts[:-1]
     ahead = (ts >= t0) & (ts <= t1) & forwards.all()

@@ -27,7 +27,7 @@ from ._diagnosis import explain
 from ._integrator import Integrator
 from ._loop import Carry, finite, Flow
 from ._results import is_okay, raise_if, RESULTS, SolveError
-from ._save import in_order, Log, Request, Saved
+from ._save import Log, Request, Saved, times_in_order
 from ._solution import Events, Solution
 from .events._initial_mode import start_mode
 from .steppers._exponential import Exponential, ExponentialStepper
@@ -132,7 +132,7 @@ def _obstacle(flow: Flow, y: Y, state: ModeState, saveat: dfx.SaveAt, result: RE
     good = finite((y, model.flow(t0, y, state), t0, t1))
     result = RESULTS.where(good, result, RESULTS.nonfinite_field)
     if ts is not None and len(ts):
-        ordered = in_order(ts.astype(t0.dtype), t0 * model.direction, t1 * model.direction)
+        ordered = times_in_order(ts.astype(t0.dtype), t0 * model.direction, t1 * model.direction)
         result = RESULTS.where(ordered, result, RESULTS.wrong_save_times)
     return result
 

@@ -1,6 +1,7 @@
 """Pictures of solutions and orbits. Each function draws into `ax` (a new figure by default), returns the axes and
 changes no global style. Matplotlib is imported by the first picture, not with nsjax."""
 
+from .._numerics._text import components as components
 from ._branch import bifurcation_diagram as bifurcation_diagram
 from ._eigenvalues import eigenvalue_path as eigenvalue_path
 from ._matrix import fundamental_matrix as fundamental_matrix, multipliers as multipliers
@@ -10,7 +11,6 @@ from ._orbit_branch import (
     orbit_diagram as orbit_diagram,
 )
 from ._parameter_plane import parameter_plane as parameter_plane
-from ._path import components as components
 from ._phase import phase_portrait as phase_portrait, poincare_section as poincare_section
 from ._poincare import brute_force as brute_force, poincare_map as poincare_map
 from ._time import time_series as time_series

@@ -6,12 +6,12 @@ from typing import Any, TYPE_CHECKING
 import jax
 import numpy as np
 
+from .._numerics._text import components
 from ..continuation.equilibria._bifurcation import Bifurcation
 from ..continuation.equilibria._branch import Branch
 from ..orbits._orbit import Orbit
 from ..system._parameter import get_parameter, parameter_path
 from ._diagram import LINE, mark, stretches, UNSTABLE, wording, write_names
-from ._path import components
 from ._style import axes_or_new, axis_label, Labels, legend as add_legend
 
 

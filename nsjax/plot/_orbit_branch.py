@@ -8,13 +8,14 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.optimize import linear_sum_assignment
 
+from .._numerics._text import components
 from ..continuation.orbits._bifurcation import OrbitBifurcation
 from ..continuation.orbits._branch import OrbitBranch
 from ..derivatives._floquet import trivial
 from ..setvalued._eigenvalue_crossings import eigenvalue_path as path_between
 from ._diagram import LINE, mark, stretches, UNSTABLE, wording, write_names
 from ._eigenvalues import eigenvalue_path
-from ._path import chosen, components
+from ._path import chosen
 from ._style import axes_or_new, axis_label, Labels, legend as add_legend
 
 

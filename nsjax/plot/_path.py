@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from .._numerics._text import components
 from .._types import Y
 from ..flow._solution import Events, Solution
 from ..orbits._orbit import Orbit
@@ -27,27 +28,6 @@ class Arc(NamedTuple):
     t: Float[np.ndarray, " times"]
     y: Values
     mode: tuple[int, ...]
-
-
-def components(y: Y, ndim: int = 0) -> dict[str, np.ndarray]:
-    """The scalar components of a state by name.
-
-    **Arguments:**
-
-    - `y`: the state, or an array of states.
-    - `ndim`: how many leading axes its leaves have that are not the state's own, such as one for time.
-
-    **Returns:** a dictionary: `"x"` for a scalar leaf `y.x` or `y["x"]`, `"q[0]"`, `"q[1]"` for a vector. A state that
-    is an array itself is called `y`.
-    """
-    named = {}
-    for path, leaf in jax.tree_util.tree_flatten_with_path(y)[0]:
-        name = jax.tree_util.keystr(path, simple=True, separator=".")
-        name = f"y.{name}" if name.isdigit() else name or "y"
-        leaf = np.asarray(leaf)
-        for index in np.ndindex(leaf.shape[ndim:]):
-            named[name + f"[{','.join(map(str, index))}]" * bool(index)] = leaf[(..., *index)]
-    return named
 
 
 def chosen(values: Mapping[str, Any], names: list[str | None]) -> list[str]:

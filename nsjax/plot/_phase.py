@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._numerics._jaxpr import is_constant
+from .._numerics._text import components
 from .._types import Y
 from ..flow._solution import Solution
 from ..orbits._orbit import Orbit
@@ -16,7 +17,7 @@ from ..system._impact import impact
 from ..system._relay import relay
 from ..system._sgn import sgn
 from ..system._switch import AbstractSwitch
-from ._path import arcs, chosen, components, solved
+from ._path import arcs, chosen, solved
 from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_legend, mode_line
 
 

@@ -6,8 +6,9 @@ from typing import Any, TYPE_CHECKING
 import jax
 import numpy as np
 
+from .._numerics._text import components
 from ..maps._brute_force import BruteForce
-from ._path import chosen, components
+from ._path import chosen
 from ._style import axes_or_new, axis_label, JUMP, Labels, legend as add_legend
 
 

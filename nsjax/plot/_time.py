@@ -5,7 +5,8 @@ from typing import Any, TYPE_CHECKING
 import jax
 import numpy as np
 
-from ._path import arcs, chosen, components, solved
+from .._numerics._text import components
+from ._path import arcs, chosen, solved
 from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_legend, mode_line
 
 

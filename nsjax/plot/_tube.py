@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .._numerics._text import components
 from ..derivatives._variational import fundamental_matrix
 from ..orbits._orbit import Orbit
-from ._path import Arc, arcs, chosen, components
+from ._path import Arc, arcs, chosen
 from ._phase import phase_portrait
 from ._style import axes_or_new, Labels, legend as add_legend, mode_line
 
