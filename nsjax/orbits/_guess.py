@@ -4,7 +4,6 @@ from typing import Any
 
 import diffrax as dfx
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
@@ -102,36 +101,3 @@ def at_start(model: SwitchedSystem, t: Scalar, y: Y, given: Relays = None) -> An
             zero = model.counts(t)[k]
         modes.append(zero)
     return model.state_at(t, y, tuple(modes))
-
-
-@interactive
-def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
-    """Whether an equilibrium of the sliding field is one of a continuum: on the surfaces that hold it the derivative of
-    the field is singular."""
-    model = SwitchedSystem.forwards(system, t0, y)
-    state = at_start(model, t0, y)
-    x, unravel = jfu.ravel_pytree(y)
-    matrix = jax.jacfwd(lambda x: ravel(model.flow(t0, unravel(x), state)))(x)
-    size = jnp.max(jnp.abs(matrix))
-    sticks = jnp.zeros((), bool)
-    for k, switch in enumerate(model.switches):
-        if isinstance(switch, sgn):
-            held = state.mode[k] == 0
-            sticks = sticks | held
-            for i in range(model.parts[k]):
-                # Off the surface, where nothing is asked, it is made regular.
-                n = jax.grad(lambda x, k=k, i=i: model.h(k, t0, unravel(x))[i])(x)
-                n = n / jnp.where(jnp.any(n != 0), jnp.linalg.norm(n), 1)
-                matrix = matrix + jnp.where(held, size, 0) * jnp.outer(n, n)
-    values = jnp.linalg.svd(matrix, compute_uv=False)
-    return sticks & (values[-1] <= 1e-9 * values[0])
-
-
-def held_throughout(system: System, begin: Array, end: Array, modes: Array) -> Bool[Array, ""]:
-    """Whether friction holds a solution along all of its arcs. (At the edge of the continuum it lets go for the root of
-    what rounding is.)"""
-    length = jnp.maximum(end - begin, 0)
-    free = [
-        jnp.sum(jnp.where(modes[:, i] == 0, 0, length)) for i, k in enumerate(system.switches) if isinstance(k, sgn)
-    ]
-    return jnp.any(jnp.asarray(free, length.dtype) <= 1e-3 * jnp.sum(length))

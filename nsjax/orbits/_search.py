@@ -16,9 +16,9 @@ from .._types import Scalar, Y
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
 from ..system._system import System
-from ._guess import held_throughout, of_relays, sticks_anywhere, undecided
+from ._guess import of_relays, undecided
 from ._orbit import Orbit
-from ._settle import repeats, repeats_held, settle_down, Settled
+from ._settle import held_throughout, repeats, repeats_held, settle_down, Settled, sticks_anywhere
 from ._shooting import Shooting
 from .segments._guess import cuts_from, cuts_near, Segment
 from .segments._solve import by_segments

@@ -1,4 +1,4 @@
-"""Where solutions settle, and after what time they return: what a search without a guess begins with.
+"""Where solutions settle, after what time they return, and whether friction holds them there in a continuum.
 
 Python follows them by the program of the search itself, lap by lap, so that nothing else is compiled.
 """
@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
@@ -21,8 +22,10 @@ from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
 from ..flow._solution import Solution
 from ..flow._solve import integrate
+from ..system._model import SwitchedSystem
+from ..system._sgn import sgn
 from ..system._system import System
-from ._guess import held_throughout, of_relays, Relays
+from ._guess import at_start, of_relays, Relays
 from ._orbit import distance, ravel
 
 
@@ -145,3 +148,36 @@ def _comes_back_held(sol: Solution, t0: Scalar, y: Y) -> Bool[Array, ""]:
     begin, end, _, modes = arcs(sol, t0, y)
     back = distance(ravel(sol.y1), ravel(y)) <= 1e-8 * (1 + jnp.max(jnp.abs(ravel(y))))
     return is_okay(sol.result) & back & held_throughout(sol.system, begin, end, modes)
+
+
+@interactive
+def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
+    """Whether an equilibrium of the sliding field is one of a continuum: on the surfaces that hold it the derivative of
+    the field is singular."""
+    model = SwitchedSystem.forwards(system, t0, y)
+    state = at_start(model, t0, y)
+    x, unravel = jfu.ravel_pytree(y)
+    matrix = jax.jacfwd(lambda x: ravel(model.flow(t0, unravel(x), state)))(x)
+    size = jnp.max(jnp.abs(matrix))
+    sticks = jnp.zeros((), bool)
+    for k, switch in enumerate(model.switches):
+        if isinstance(switch, sgn):
+            held = state.mode[k] == 0
+            sticks = sticks | held
+            for i in range(model.parts[k]):
+                # Off the surface, where nothing is asked, it is made regular.
+                n = jax.grad(lambda x, k=k, i=i: model.h(k, t0, unravel(x))[i])(x)
+                n = n / jnp.where(jnp.any(n != 0), jnp.linalg.norm(n), 1)
+                matrix = matrix + jnp.where(held, size, 0) * jnp.outer(n, n)
+    values = jnp.linalg.svd(matrix, compute_uv=False)
+    return sticks & (values[-1] <= 1e-9 * values[0])
+
+
+def held_throughout(system: System, begin: Array, end: Array, modes: Array) -> Bool[Array, ""]:
+    """Whether friction holds a solution along all of its arcs. (At the edge of the continuum it lets go for the root of
+    what rounding is.)"""
+    length = jnp.maximum(end - begin, 0)
+    free = [
+        jnp.sum(jnp.where(modes[:, i] == 0, 0, length)) for i, k in enumerate(system.switches) if isinstance(k, sgn)
+    ]
+    return jnp.any(jnp.asarray(free, length.dtype) <= 1e-3 * jnp.sum(length))
