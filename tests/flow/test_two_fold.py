@@ -17,7 +17,7 @@ from nsjax import RESULTS, solve
 from nsjax.system._model import SwitchedSystem
 
 
-class Plane(NamedTuple):
+class VerticalPlane(NamedTuple):
     x: Array
     z: Array
 
@@ -26,7 +26,7 @@ class VisibleVisible(nsjax.System):
     """x' = 1, z' = x s: f± = (1, ±x), λ = 0, x = x0 + t."""
 
     def vector_field(self, t, y, s):
-        return Plane(jnp.ones_like(y.x), y.x * s.side)
+        return VerticalPlane(jnp.ones_like(y.x), y.x * s.side)
 
     @nsjax.sgn
     def side(self, t, y):
@@ -39,7 +39,7 @@ class VisibleInvisible(nsjax.System):
     g: float = 2.0
 
     def vector_field(self, t, y, s):
-        return Plane(s.side + 0 * y.x, y.x * (1 - self.g + (1 + self.g) * s.side) / 2)
+        return VerticalPlane(s.side + 0 * y.x, y.x * (1 - self.g + (1 + self.g) * s.side) / 2)
 
     @nsjax.sgn
     def side(self, t, y):
@@ -69,8 +69,8 @@ class InvisibleInvisible(nsjax.System):
 
 # The model, a start, when it reaches the two-fold, and the solution that goes on sliding.
 FOLDS = {
-    "visible-visible": (VisibleVisible(), Plane(-1.0, 0.0), 1.0, lambda t: [t - 1, 0]),
-    "visible-invisible": (VisibleInvisible(), Plane(-1.0, 0.0), 3.0, lambda t: [t / 3 - 1, 0]),
+    "visible-visible": (VisibleVisible(), VerticalPlane(-1.0, 0.0), 1.0, lambda t: [t - 1, 0]),
+    "visible-invisible": (VisibleInvisible(), VerticalPlane(-1.0, 0.0), 3.0, lambda t: [t / 3 - 1, 0]),
     "invisible-invisible": (
         InvisibleInvisible(),
         Space(1.0, 0.6, 0.0),
@@ -119,11 +119,11 @@ def test_start_at_it_or_behind(kind, x):
     """At the two-fold a visible side is left to, and nothing is unique; behind it a side must be chosen. (To slide from
     the very point has no field: λ = 0/0.)"""
     system = FOLDS[kind][0]
-    sol = solve(system, 0.0, 0.3, Plane(x, 0.0), throw=False)
+    sol = solve(system, 0.0, 0.3, VerticalPlane(x, 0.0), throw=False)
     assert not sol.unique
     assert sol.result == (RESULTS.successful if x == 0 else RESULTS.repulsive_sliding)
     for mode in (0, 1):
-        sol = solve(system, 0.0, 0.3, Plane(x, 0.0), mode={"side": mode}, throw=False)
+        sol = solve(system, 0.0, 0.3, VerticalPlane(x, 0.0), mode={"side": mode}, throw=False)
         undefined = (x, mode) == (0.0, 0)
         assert not sol.unique and sol.mode1 == mode
         assert sol.result == (RESULTS.nonfinite_field if undefined else RESULTS.successful)
@@ -164,7 +164,7 @@ class Turning(nsjax.System):
     """A surface that is not affine, and attracts where it is slid on: z = sin x, with fields that point at it."""
 
     def vector_field(self, t, y, s):
-        return Plane(jnp.ones_like(y.x), -2 * s.side + 0 * y.z)
+        return VerticalPlane(jnp.ones_like(y.x), -2 * s.side + 0 * y.z)
 
     @nsjax.sgn
     def side(self, t, y):
@@ -173,7 +173,7 @@ class Turning(nsjax.System):
 
 def test_sliding_that_stays_attracted():
     """M_kk that is not constant is no matter while it keeps its sign."""
-    sol = solve(Turning(), 0.0, 10.0, Plane(0.0, 1.0), stepsize_controller=pid(1e-9))
+    sol = solve(Turning(), 0.0, 10.0, VerticalPlane(0.0, 1.0), stepsize_controller=pid(1e-9))
     assert sol.unique and sol.mode1 == 0
     np.testing.assert_allclose(sol.y1.z, np.sin(10.0), atol=1e-8)
 
@@ -185,5 +185,5 @@ def test_cost():
         return SwitchedSystem(system, jnp.ones(()), jnp.zeros(()), jax.tree.map(jnp.asarray, y0)).steady
 
     assert not any(steady(system, y0) for system, y0, *_ in FOLDS.values())
-    assert steady(Turning(), Plane(0.0, 0.0)) and not steady(Beside(), Space(0.0, 0.0, 0.0))
+    assert steady(Turning(), VerticalPlane(0.0, 0.0)) and not steady(Beside(), Space(0.0, 0.0, 0.0))
     assert steady(nsjax.gallery.StickSlip(), Motion(0.0, 0.0))
