@@ -152,7 +152,7 @@ def _polish(a: list[Scalar], wanted: Bool[Array, ""]) -> Scalar:
         guess = u - step
         inside = (guess >= low) & (guess <= high) & (slope < 0)  # it is a root downwards
         # Where the curvature rules (near a double root) Halley's steps are short without being good. Every third step
-        # bisects, unless Halley has all but halted: a flat polynomial cannot stall the search.
+        # bisects, unless Halley has almost stopped: a flat polynomial cannot stall the search.
         step, ratio = jnp.abs(step), jnp.abs(ratio)
         trusted = inside & (ratio <= 0.5) & ((count % 3 != 2) | (step < 1e-2))
         exact = (value == 0) & (slope < 0)

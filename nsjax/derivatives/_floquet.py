@@ -124,7 +124,7 @@ def floquet(
 
 
 def stability(multipliers: Complex[Array, " n"], autonomous: bool) -> Bool[Array, ""]:
-    """Whether all multipliers but the trivial one lie inside the unit circle."""
+    """Whether all multipliers except the trivial one lie inside the unit circle."""
     inside = jnp.abs(multipliers) < 1
     if autonomous:
         inside = inside | trivial(multipliers)

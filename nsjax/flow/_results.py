@@ -134,8 +134,8 @@ def promoted(result: Any) -> RESULTS:
 
 
 def raise_if(bad: Bool[Array, ""], result: RESULTS, tree: Any) -> Any:
-    """`tree`, if not `bad`, else an error with the message of `result`. Derivatives raise it too: whoever wants these
-    alone computes nothing else, and would be given what belongs to a solution that failed."""
+    """`tree`, if not `bad`, else an error with the message of `result`. Derivatives raise it too: a program for these
+    alone computes nothing else, and would return those of a solution that failed."""
     if not isinstance(bad, Tracer) and not isinstance(result._value, Tracer):
         if np.any(bad):
             raise SolveError(str(RESULTS[result]))

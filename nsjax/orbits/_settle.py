@@ -165,7 +165,7 @@ def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
             held = state.mode[k] == 0
             sticks = sticks | held
             for i in range(model.parts[k]):
-                # Off the surface, where nothing is asked, it is made regular.
+                # In the direction off the surface the field says nothing: there the matrix is made regular.
                 n = jax.grad(lambda x, k=k, i=i: model.h(k, t0, unravel(x))[i])(x)
                 n = n / jnp.where(jnp.any(n != 0), jnp.linalg.norm(n), 1)
                 matrix = matrix + jnp.where(held, size, 0) * jnp.outer(n, n)
@@ -174,8 +174,8 @@ def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
 
 
 def held_throughout(system: System, begin: Array, end: Array, modes: Array) -> Bool[Array, ""]:
-    """Whether friction holds a solution along all of its arcs. (At the edge of the continuum it lets go for the root of
-    what rounding is.)"""
+    """Whether friction holds a solution along all of its arcs. (At the edge of the continuum it lets go for a time
+    of the size of the root of rounding.)"""
     length = jnp.maximum(end - begin, 0)
     free = [
         jnp.sum(jnp.where(modes[:, i] == 0, 0, length)) for i, k in enumerate(system.switches) if isinstance(k, sgn)

@@ -36,7 +36,7 @@ class ModeState(NamedTuple):
 
 
 def pick(values: tuple[Any, ...], index: Any) -> Any:
-    """One of several, by an index that may be traced, or None if there is but one."""
+    """One of several, by an index that may be traced, or None if there is only one."""
     found = values[0]
     for i, value in enumerate(values[1:], 1):
         found = jnp.where(index == i, value, found)
