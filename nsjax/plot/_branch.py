@@ -82,8 +82,8 @@ def _measured(measure: str | Callable[[Any], Any], ys: Any) -> np.ndarray:
 
 
 def _periodic(ax: "Axes", family: Sequence[Orbit], parameter: str, measure: str | Callable[[Any], Any]) -> None:
-    # Extremes of samples, where `Orbit.maximum` is exact: on an arc of half a wave they are off by 3e-4 of the amplitude
-    # at most, which is not visible, and the exact program takes several times as long to compile.
+    # Extremes of samples, where `Orbit.maximum` is exact: on an arc of half a wave they are off by 3e-4 of the
+    # amplitude at most, which is not visible, and the exact program takes several times as long to compile.
     values, most, least, stable = [], [], [], []
     for orbit in family:
         path = jax.tree.map(lambda x: x.reshape(-1), orbit.path().y)
