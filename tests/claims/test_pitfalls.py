@@ -161,7 +161,7 @@ def chain_starts(n):
     }
 
 
-@pytest.mark.parametrize("n", [5, 10])
+@pytest.mark.parametrize("n", [5, pytest.param(10, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("start", ["mixed", "slipping", "sticking", "mirrored"])
 def test_many_blocks(start, n):
     """Pitfalls 6, 7, 32: against matrix exponentials; the order of blocks and switches does not matter; and energy is
@@ -215,7 +215,9 @@ class Stack(nsjax.System):
 
 
 def run_stack(A, p, q, t1):
-    return solve(Stack(*map(jnp.asarray, (A, p, q))), 0.0, t1, Point(jnp.zeros(len(p))), throw=False)
+    """(Bosh3 is exact on its parabolas.)"""
+    y0 = Point(jnp.zeros(len(p)))
+    return solve(Stack(*map(jnp.asarray, (A, p, q))), 0.0, t1, y0, solver=dfx.Bosh3(), throw=False)
 
 
 def consistent(A, p):
@@ -414,7 +416,7 @@ def test_end_next_to_an_event():
     p = jnp.asarray([1.0, 1.0, 0.0])
     event = float(toggle()(p, jnp.asarray(5.0))[1][0][1])
     for ulps in (-64, -2, -1, 0, 1, 2, 64):
-        t1 = event + ulps * np.spacing(4.0)
+        t1 = event + ulps * float(np.spacing(4.0))
         _, (out, num) = toggle()(p, jnp.asarray(t1))
         assert num in ((1,) if ulps < -4 else (2,) if ulps > 4 else (1, 2)), ulps
         np.testing.assert_allclose(out[-2:], [t1 - 4, 1], atol=1e-12)
@@ -427,9 +429,10 @@ def test_there_and_back():
     x = np.where(np.arange(11) % 2, np.where(np.arange(11) % 4 == 1, 0.5, -0.5), 0.0)
     np.testing.assert_allclose(sol.ys.x, x, atol=1e-11)
     np.testing.assert_allclose(sol.ys.v, np.where(np.arange(11) % 2, 0, (-1.0) ** (np.arange(11) // 2)), atol=1e-11)
-    back = solve(Toggle(), 9.0, 0.0, Motion(0.5, 0.0), saveat=dfx.SaveAt(ts=ts[:10][::-1]))
+    early = jnp.append(ts[:10], 9.0)  # one twice: as many as before are no other program
+    back = solve(Toggle(), 9.0, 0.0, Motion(0.5, 0.0), saveat=dfx.SaveAt(ts=early[::-1]))
     np.testing.assert_allclose(
-        np.stack([back.ys.x, back.ys.v])[:, ::-1], np.stack([sol.ys.x, sol.ys.v])[:, :10], atol=1e-11
+        np.stack([back.ys.x, back.ys.v])[:, :0:-1], np.stack([sol.ys.x, sol.ys.v])[:, :10], atol=1e-11
     )
     np.testing.assert_allclose(times(back), [8, 6, 4, 2], atol=1e-11)
 

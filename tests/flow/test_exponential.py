@@ -1,5 +1,7 @@
 """The exact flow of fields that are affine in the state."""
 
+import functools
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -165,7 +167,7 @@ def test_sliding_on_two_surfaces(direction):
     system = Pair()
     got, want = (
         solve(system, 0.0, direction * 2.0, Plane(1.0, 0.3), solver=m, throw=False)
-        for m in (Exponential(), nsjax.Taylor())
+        for m in (Exponential(), nsjax.Taylor(6))
     )
     assert itinerary(got) == itinerary(want) and len(itinerary(got)) == (2 if direction > 0 else 0)
     np.testing.assert_allclose(times(got), times(want), atol=1e-13)
@@ -185,13 +187,17 @@ class Chord(nsjax.System):
         return y[0] + 1.0 - self.depth
 
 
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, 0))
+def events_of_chord(depth, t0):
+    y0 = (jnp.cos(t0), -jnp.sin(t0), 0.0)
+    return solve(Chord(depth), t0, 6.0, y0, solver=Exponential(), throw=False).events
+
+
 @pytest.mark.parametrize("depth", [1e-1, 1e-7, 1e-13, -1e-13])
 def test_roots_next_to_each_other(depth):
     """Pitfall 5: two roots down to 4e-7 apart, and a near miss, in the middle of a step; however steps fall."""
-    sol = jax.jit(
-        jax.vmap(lambda t0: solve(Chord(depth), t0, 6.0, (jnp.cos(t0), -jnp.sin(t0), 0.0), solver=Exponential(),
-                                  throw=False).events),
-    )(np.linspace(0, 2.5, 40))  # fmt: skip
+    sol = events_of_chord(depth, np.linspace(0, 2.5, 40))
     if depth < 0:
         assert not np.any(sol.num)
         return
@@ -266,7 +272,7 @@ def test_sticking_where_the_forcing_turns():
     def ends(parameters):
         exact, steps = (
             solve(Pressed(**parameters), 0.0, 20.0, (0.5,), solver=solver, stepsize_controller=pid(1e-12), throw=False)
-            for solver in (Exponential(), nsjax.Taylor())
+            for solver in (Exponential(), nsjax.Taylor(12))
         )
         return exact.result, exact.events.num == steps.events.num, exact.y1[0] - steps.y1[0]
 
