@@ -19,9 +19,8 @@ from ._attraction import coinciding, reach
 from ._laws import Instant, judge, Outcome
 
 
-# Up to this many switches, every assignment is tried: at most 81. The search by release and taking back, once used for
-# any number, let slip what could stick, or went in circles. What counts is how many switches the model has, not how
-# many are at their surfaces: a `cond` between both ways made programs that came to a standstill in batches.
+# Up to this many switches at their surfaces, every assignment is tried: at most 81. The search by release and taking
+# back, once used for any number, let slip what could stick, or went in circles.
 _TRIED = 4
 
 
@@ -37,10 +36,11 @@ def settle(
     """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}, every contact one from {1, 0}.
 
     An assignment is valid if each that holds has |λ| <= b (a contact a force λ >= 0) and each other one moves to its
-    side. Of up to four switches every assignment is tried; of the valid ones those are preferred in which no surface
-    that repels holds what arrives at it, of these the ones that hold most, that keep what held before, and that
-    cross what is met. Of more, all are held that attract, the one that violates its law most is released, to the sign
-    of its λ, and a released switch whose motion then opposes this is taken back, until nothing is violated.
+    side. Where up to four switches are at their surfaces every assignment is tried; of the valid ones those are
+    preferred in which no surface that repels holds what arrives at it, of these the ones that hold most, that keep what
+    held before, and that cross what is met. Where more are, all are held that attract, the one that violates its law
+    most is released, to the sign of its λ, and a released switch whose motion then opposes this is taken back, until
+    nothing is violated.
 
     **Arguments:**
 
@@ -70,14 +70,18 @@ def settle(
         here = _together(here, trial)
         for k in filter(here.dry, which):
             trial[k] = jnp.where(here.at[k], 0, trial[k])
-    every = 1 < len(which) <= _TRIED
-    seen = here.look(trial) if model.contacts or not every else None
-    noise = here.noise(seen.s if seen else {})
-    if every:
-        trial, seen, others, wrong = _best(here, trial, noise)
-    else:
-        assert seen is not None
-        trial, seen, others, wrong = (_alone if len(which) == 1 else _search)(here, trial, seen, noise)
+    several, crowded = len(which) > 1, len(which) > _TRIED
+    held = here.look(trial) if model.contacts or crowded or not several else None
+    noise = here.noise(held.s if held else {})
+    if several:
+        found = _best(here, trial, noise)
+    if held is not None and not several:
+        found = _alone(here, trial, held, noise)
+    if held is not None and crowded:
+        # Both are worked out: with a `cond` between them batches of such models came to a standstill.
+        more = sum(here.at[k].astype(jnp.int32) for k in which) > _TRIED
+        found = jax.tree.map(ft.partial(jnp.where, more), _search(here, trial, held, noise, more), found)
+    trial, seen, others, wrong = found
     _, rates, slopes, _ = seen
     if model.contacts and len(model.holdable) > 1:
         trial = _pinned(here, trial, rates)
@@ -177,16 +181,31 @@ def _elsewhere(
     return jnp.any(differs & clear[:, None], axis=0)
 
 
+def _assignments(here: Instant) -> tuple[Int[Array, "rows m"], Bool[Array, " rows"]]:
+    """All assignments of up to four switches that are at their surfaces, one a row; and which of the rows there are.
+    What is not at its surface has no choice: its first option stands for what it is."""
+    model, which = here.model, here.which
+    options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
+    at = jnp.stack([here.at[k] for k in which])
+    if len(which) <= _TRIED:
+        table = np.array(list(itertools.product(*options)), np.int32)
+        return jnp.asarray(table), jnp.all(at | (table == np.array([o[0] for o in options], np.int32)), axis=1)
+    # Of a model with more, each row says which option the first that is at its surface has, the second, and so on.
+    codes = np.array(list(itertools.product(range(3), repeat=_TRIED)), np.int32)
+    turn = jnp.cumsum(at, dtype=jnp.int32) - 1
+    code = sum(jnp.where(at & (turn == i), codes[:, i : i + 1], 0) for i in range(_TRIED))
+    real = jnp.all(code < np.array([len(o) for o in options], np.int32), axis=1)
+    real = real & jnp.all((np.arange(_TRIED, dtype=np.int32) <= turn[-1]) | (codes == 0), axis=1)
+    first, second, third = np.array([(*o, 0)[:3] for o in options], np.int32).T
+    return jnp.where(code == 0, first, jnp.where(code == 1, second, third)), real
+
+
 def _best(here: Instant, trial: dict, noise: dict) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
     """The assignment to be preferred, of all that are valid; what it leads to; of each switch whether another solution
     gives it another mode; and whether the choice is open."""
-    model, which = here.model, here.which
-    options = [(1, 0) if k in model.contacts else (0, 1, -1) if k in model.holdable else (1, -1) for k in which]
-    table = jnp.asarray(np.array(list(itertools.product(*options)), np.int32))
+    which = here.which
+    table, real = _assignments(here)
     found = jax.vmap(ft.partial(judge, here, trial, noise))(table)
-    # A switch that is not at its surface has no choice: its first option stands for what it is.
-    at = jnp.stack([here.at[k] for k in which])
-    real = jnp.all(at | (table == np.array([o[0] for o in options], np.int32)), axis=1)
     score = jnp.where(found.valid & real, found.rank, -1)
     best = jnp.argmax(score)
     seen = jax.tree.map(lambda x: x[best], found.seen)
@@ -237,9 +256,9 @@ def _either(multiplier: Scalar, bound: Any, slope: Scalar) -> Bool[Array, ""]:
 
 
 def _search(
-    here: Instant, trial: dict, seen: Outcome, noise: dict
+    here: Instant, trial: dict, seen: Outcome, noise: dict, wanted: Bool[Array, ""]
 ) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
-    """The same where there are too many to try every assignment."""
+    """The same where there are too many to try every assignment, if that is `wanted`."""
     which, came = here.which, here.came
     trial = _guess(here, trial, seen)
     # A bound that is reached together with that of another switch is left with it, not in a second event.
@@ -264,7 +283,7 @@ def _search(
         return wrong & (count < 2 * len(which) + 2)
 
     trial = {k: m.astype(jnp.int32) for k, m in trial.items()}
-    begin = (jnp.zeros((), jnp.int32), trial, jnp.ones((), bool))
+    begin = (jnp.zeros((), jnp.int32), trial, wanted)
     _, trial, wrong = lax.while_loop(unsettled, amend, begin)
     # Of all other assignments those in which one switch, or one group on surfaces that coincide, is let go or held.
     chosen, seen, table = jnp.stack([trial[k] for k in which]), here.look(trial), []
