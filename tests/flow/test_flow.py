@@ -82,28 +82,39 @@ def test_stick_slip_from_every_kind_of_start():
         np.testing.assert_allclose([sol.y1.x[i], sol.y1.v[i]], ref.y, atol=1e-8)
 
 
-def test_scale_of_the_indicator_function_does_not_matter():
+UNITS = 10.0 ** np.array([0.0, -12.0, -6.0, 6.0, 12.0])
+BESIDE = 0.2 + np.array([0.0, np.spacing(0.2), -np.spacing(0.2), 1e-9, -1e-9])
+
+
+@pytest.fixture(scope="module")
+def in_units():
+    """The belt with h in all of `UNITS`, as rows: from above it for a time of 30, and from `BESIDE` it for one of 5."""
+
+    @jax.jit
+    @jax.vmap
+    def run(scale, x, v, t1):
+        sol = solve(Belt(scale=scale), 0.0, t1, Motion(x, v), throw=False)
+        return sol.result == RESULTS.successful, sol.events.num, sol.mode0[0], jnp.stack(sol.y1)
+
+    starts = np.array([(2.5, -0.5, 30.0), *((0.5, v, 5.0) for v in BESIDE)])
+    lanes = jnp.asarray(np.repeat(UNITS, len(starts))), *jnp.asarray(np.tile(starts, (len(UNITS), 1)).T)
+    return [np.reshape(x, (len(UNITS), len(starts), *x.shape[1:])) for x in run(*lanes)]
+
+
+def test_scale_of_the_indicator_function_does_not_matter(in_units):
     """Pitfall 27: h multiplied by 1e-12 ... 1e12."""
-    scale = 10.0 ** jnp.asarray([0.0, -12.0, -6.0, 6.0, 12.0])
-    sol = jax.jit(jax.vmap(lambda s: solve(Belt(scale=s), 0.0, 30.0, Motion(2.5, -0.5), throw=False)))(scale)
-    assert np.all(sol.result == RESULTS.successful)
-    assert np.all(sol.events.num == sol.events.num[0]) and sol.events.num[0] > 3
-    np.testing.assert_allclose(flat(sol.y1), np.tile(flat(sol.y1)[:1], (5, 1)), atol=1e-12)
+    fine, num, _, y = (x[:, 0] for x in in_units)
+    assert np.all(fine)
+    assert np.all(num == num[0]) and num[0] > 3
+    np.testing.assert_allclose(y, np.tile(y[:1], (5, 1)), atol=1e-12)
 
 
-def test_scale_does_not_matter_on_the_surface():
+def test_scale_does_not_matter_on_the_surface(in_units):
     """Pitfall 27: who starts on the surface, apart from an ulp, is on it in every unit of h, and who starts beside it not."""
-    v = 0.2 + jnp.asarray([0.0, np.spacing(0.2), -np.spacing(0.2), 1e-9, -1e-9])
-    scale = 10.0 ** jnp.asarray([0.0, -12.0, 12.0])
-
-    def run(scale, v):
-        sol = solve(Belt(scale=scale), 0.0, 5.0, Motion(0.5, v), throw=False)
-        return sol.mode0[0], jnp.stack(sol.y1), sol.result
-
-    mode, y, result = jax.jit(jax.vmap(jax.vmap(run, (None, 0)), (0, None)))(scale, v)
-    assert np.all(result == RESULTS.successful)
-    np.testing.assert_array_equal(mode, [[0, 0, 0, 1, -1]] * 3)
-    np.testing.assert_allclose(y, np.tile(y[:1], (3, 1, 1)), atol=1e-12)
+    fine, _, mode, y = (x[:, 1:] for x in in_units)
+    assert np.all(fine)
+    np.testing.assert_array_equal(mode, [[0, 0, 0, 1, -1]] * 5)
+    np.testing.assert_allclose(y, np.tile(y[:1], (5, 1, 1)), atol=1e-12)
 
 
 class Ring(Circle):
@@ -116,13 +127,34 @@ class Ring(Circle):
         return self.scale * (y.x**2 + y.y**2 - 1)
 
 
-def test_scale_of_a_surface_that_is_not_affine():
+@pytest.fixture(scope="module")
+def rings():
+    """The circle in three units for a time of 3, and for one of 1000."""
+
+    def run(scale, t1):
+        return solve(
+            Ring(scale=scale), 0.0, t1, Plane(1.5, 0.0), stepsize_controller=pid(1e-9), max_steps=100_000, throw=False
+        )
+
+    return jax.jit(jax.vmap(run))(10.0 ** jnp.asarray([0.0, -12.0, 12.0, 0.0]), jnp.asarray([3.0, 3.0, 3.0, 1000.0]))
+
+
+def test_scale_of_a_surface_that_is_not_affine(rings):
     """Pitfall 27: a polynomial stands for h to a fraction of h, whatever its unit."""
-    scale = 10.0 ** jnp.asarray([0.0, -12.0, 12.0])
-    sol = jax.jit(jax.vmap(lambda s: solve(Ring(scale=s), 0.0, 3.0, Plane(1.5, 0.0), throw=False)))(scale)
-    assert np.all(sol.result == RESULTS.successful) and np.all(sol.events.num == 1)
-    assert np.all(sol.stats["num_steps"] == sol.stats["num_steps"][0])
-    np.testing.assert_allclose(flat(sol.y1), np.tile(flat(sol.y1)[:1], (3, 1)), atol=1e-12)
+    assert np.all(rings.result == RESULTS.successful) and np.all(rings.events.num == 1)
+    steps, y1 = rings.stats["num_steps"][:3], flat(rings.y1)[:3]
+    assert np.all(steps == steps[0])
+    np.testing.assert_allclose(y1, np.tile(y1[:1], (3, 1)), atol=1e-12)
+
+
+def test_long_sliding_does_not_drift(rings):
+    """Pitfall 14: 1000 time units on a circle, a surface which is not affine."""
+    met, y1 = rings.events.t[3, 0], flat(rings.y1)[3]
+    r = 1.5 * np.exp(0.5 * (1 - np.cos(met)) - met)
+    np.testing.assert_allclose(r, 1, atol=1e-8)
+    np.testing.assert_allclose(y1, [np.cos(1000), np.sin(1000)], atol=1e-5)
+    assert abs(np.hypot(*y1) - 1) < 1e-15 * 4
+    assert rings.events.num[3] == 1
 
 
 class Season(nsjax.System):
@@ -329,17 +361,6 @@ def test_two_surfaces_met_at_one_instant():
     np.testing.assert_allclose(times(sol), 0.4, atol=1e-13)
     assert np.all(sol.mode1 == 0)
     np.testing.assert_allclose(flat(sol.y1), 0, atol=1e-14)
-
-
-def test_long_sliding_does_not_drift():
-    """Pitfall 14: 1000 time units on a circle, a surface which is not affine."""
-    p = Circle()
-    sol = solve(p, 0.0, 1000.0, Plane(1.5, 0.0), stepsize_controller=pid(1e-9), max_steps=100_000)
-    r = 1.5 * np.exp(0.5 * (1 - np.cos(times(sol)[0])) - times(sol)[0])
-    np.testing.assert_allclose(r, 1, atol=1e-8)
-    np.testing.assert_allclose(flat(sol.y1), [np.cos(1000), np.sin(1000)], atol=1e-5)
-    assert abs(np.hypot(*flat(sol.y1)) - 1) < 1e-15 * 4
-    assert len(sol.events) == 1
 
 
 # Impacts, friction, a relay and a clock together.
