@@ -13,18 +13,16 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
-import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._autodiff import frozen
 from .._numerics._jaxpr import dependence, is_affine, is_constant, touched
-from .._numerics._linalg import parallel, Row, row, solve_rows
 from .._types import Scalar, Y
 from ._clocked import Clocked
-from ._linearisation import Linearisation, linearise
 from ._mode import BEYOND, ModeState, pick, put, Slot
 from ._parameter import Path, put_parameter
+from ._sliding import linearised, project, resolved
 from ._system import System
 
 
@@ -193,91 +191,18 @@ class SwitchedSystem(Clocked):
         """Switch values of a mode, with 0 for those which are held, and for contacts."""
         return tuple(switch.value(m, t.dtype) for switch, m in zip(self.switches, state.mode))
 
-    def linearised(self, t: Scalar, y: Y, state: ModeState, s: tuple) -> Linearisation:
-        """The field and the rates of the holdable surfaces at `s`, and how they change with the holdable values."""
-        self = self._in(state)
-        tree = jax.tree.structure(y)
-
-        def field(*values: Scalar) -> list[Any]:
-            return jax.tree.leaves(self.field(t, y, put(s, self.holdable, values)))
-
-        def levels(t: Scalar, *leaves: Any) -> list[Scalar]:
-            return [self.level(k, t, jax.tree.unflatten(tree, leaves), state) for k in self.holdable]
-
-        near = linearise(field, tuple(s[k] for k in self.holdable), levels, t, y, self.acts)
-        if self.contacts and len(self.holdable) > 1:
-            # Friction along a contact that holds already is free, and so is that of a contact without force: a trace of
-            # compliance gives it the value 0.
-            least = jnp.sqrt(jnp.finfo(t.dtype).tiny)
-            for i in [i for i, k in enumerate(self.holdable) if k not in self.contacts]:
-                total = sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(near.slope[i]))
-                trace = jnp.where(total == 0, least, 4 * jnp.finfo(t.dtype).eps * total)
-                own = row([trace if i == j else jnp.zeros_like(trace) for j in range(len(self.holdable))])
-                near.slope[i] = jax.tree.map(jnp.subtract, near.slope[i], own)
-        return near
-
     def linear(self, t: Scalar, y: Y, state: ModeState, s: tuple) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
         """Rates of the holdable surfaces at `s`, and their derivatives with respect to the holdable values."""
-        near = self.linearised(t, y, state, s)
+        near = linearised(self._in(state), t, y, state, s)
         return jnp.asarray(near.rates), jnp.stack([jnp.asarray(rates) for rates in near.slope])
-
-    def multipliers(self, slope: list[Any], right: Row, held: Any) -> Any:
-        """σ with slope σ = right over the holdable switches that are `held`, and 0 for the others.
-
-        Where surfaces coincide (friction elements on one velocity) slope is singular: it determines only the sum of
-        what they do. They share it in proportion to their bounds, |λ_i| / b_i = |λ_j| / b_j, as elastic elements do
-        that yield at the same deflection. No other split holds for longer: all of them reach their bounds together,
-        each in the direction in which it resists, and so when the sum of their strengths is spent.
-        """
-        m, zero, one = len(slope), jnp.zeros_like(right[0]), jnp.ones_like(right[0])
-        # Off the surface a slope may vanish, and must not matter; on it the quotient is infinite, and so is noticed.
-        units = [row([one if i == j else zero for j in range(m)]) for i in range(m)]
-        rows = [
-            jax.tree.map(lambda x, h, u, i=i: jnp.where(held[i] & h, x, u), slope[i], held, units[i]) for i in range(m)
-        ]
-        right, matrix = jax.tree.map(lambda r, h: jnp.where(h, r, 0), right, held), list(rows)
-        for i, j in self.pairs:
-            same = held[i] & held[j] & parallel(rows[i], rows[j])
-            # The row tells in which direction each of them pushes the surface, and either of the two rows will do.
-            bounds = {i: self.bound(self.holdable[j]), j: -self.bound(self.holdable[i])}
-            weights = row([jnp.asarray(bounds.get(n, zero), zero.dtype) for n in range(m)])
-            share = jax.tree.map(lambda x, w: jnp.where(x < 0, -w, w), rows[i], weights)
-            matrix[j] = jax.tree.map(lambda a, b, same=same: jnp.where(same, a, b), share, matrix[j])
-            one_of = row([same if n == j else jnp.zeros_like(same) for n in range(m)])
-            right = jax.tree.map(lambda r, gone: jnp.where(gone, 0, r), right, one_of)
-        return solve_rows(matrix, right)
-
-    def _resolved(self, t: Scalar, y: Y, state: ModeState) -> tuple[tuple[Any, ...], Y]:
-        """The value of every switch in a mode, and the field for them."""
-        self = self._in(state)
-        s, which = self.signs(t, state), self.holdable
-        if not which:
-            return s, self.field(t, y, s)
-        held = row([self.held(k, state.mode[k]) for k in which])
-
-        def moves(s: tuple) -> tuple[Row, Linearisation]:
-            near = self.linearised(t, y, state, s)
-            return self.multipliers(near.slope, jax.tree.map(jnp.negative, near.rates), held), near
-
-        def after(s: tuple, move: Row) -> tuple:
-            return put(s, which, [s[k] + d for k, d in zip(which, move)])
-
-        if self.jointly_affine:
-            move, near = moves(s)
-            return after(s, move), near.pulled(near.field, move)
-        # Newton's method for a multi-affine field, in a fixed number of steps: such a loop can be transposed. Friction
-        # proportional to a contact force has no effect where that is zero: the search sets out from another value.
-        begin = [jnp.where(h, 1, s[k]) if k in self.contacts else s[k] for k, h in zip(which, held)]
-        s = lax.fori_loop(0, 6, lambda _, s: after(s, moves(s)[0]), put(s, which, begin))
-        return s, self.field(t, y, s)
 
     def values(self, t: Scalar, y: Y, state: ModeState) -> tuple[Any, ...]:
         """The value of every switch in a mode: signs, and the multipliers λ of those that are held, (2.20)."""
-        return self._resolved(t, y, state)[0] if self.holdable else self.signs(t, state)
+        return resolved(self._in(state), t, y, state)[0] if self.holdable else self.signs(t, state)
 
     def flow(self, t: Scalar, y: Y, state: ModeState) -> Y:
         """The right-hand side in a mode; for a sliding one it is Filippov's field (2.19)."""
-        return self._resolved(t, y, state)[1]
+        return resolved(self._in(state), t, y, state)[1]
 
     def force(self, t: Scalar, y: Y, state: ModeState) -> Scalar:
         """The largest component of the terms that make up the field: with it those which cancel where it is held."""
@@ -292,31 +217,8 @@ class SwitchedSystem(Clocked):
         return ft.reduce(jnp.maximum, [jnp.max(x) for x in jax.tree.leaves(size)])
 
     def project(self, t: Scalar, y: Y, state: ModeState) -> Y:
-        """Removes the drift off the surfaces that hold the solution.
-
-        The state moves along ∂f/∂s, the direction in which the switch acts, so that the result does not depend on the
-        units of the state; positions move along what this is in a unit of time. One Newton step: exact when h is
-        affine, else quadratic in a drift that is itself of the order of the local error.
-        """
-        which = self.holdable
-        if not which:
-            return y
-        self = self._in(state)
-        s = self.signs(t, state) if self.jointly_affine and not self.contacts else self.values(t, y, state)
-        held = row([self.held(k, state.mode[k]) for k in which])
-        near = self.linearised(t, y, state, s)
-
-        def closing(gaps: list[Scalar]) -> Row:
-            """The values which close the gaps."""
-            found = self.multipliers(near.slope, row([-g for g in gaps]), held)
-            return jax.tree.map(lambda h, d: jnp.where(h, d, 0), held, found)
-
-        if self.contacts:
-            gaps = [self.h(k, t, y)[0] if k in self.contacts else jnp.zeros_like(t) for k in which]
-            push = near.pulled(jax.tree.map(jnp.zeros_like, y), closing(gaps))
-            dq = jax.jvp(lambda y: self.field(t, y, s), (y,), (push,))[1]
-            y = jax.tree.map(jnp.add, y, dq)
-        return near.pulled(y, closing([self.level(k, t, y, state) for k in which]))
+        """Removes the drift off the surfaces that hold the solution."""
+        return project(self._in(state), t, y, state) if self.holdable else y
 
     # Guards: positive while the mode lasts. Slot i is the maximum over the last axis, so that the event is the
     # instant at which all of its entries have become non-positive.

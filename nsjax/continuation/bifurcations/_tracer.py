@@ -8,8 +8,9 @@ import numpy as np
 
 from ..._numerics._bracket import bracketed
 from ...orbits.segments._equations import linearised
+from .._step_length import FIRST, next_length, SHORTEST, turn_between, TURNED
 from ..orbits._test_functions import BRANCH, CORNERS, Test
-from ..orbits._tracer import FIRST, LAST_FOUND, OrbitPoint, SHORTEST, TURN, TURNED
+from ..orbits._tracer import LAST_FOUND, OrbitPoint
 from ..orbits.corners._grazing import cut_itinerary
 from ._surface import AbstractBifurcationTracer, BifurcationTracer, cleared, CUSP, DELTA, Place, RESONANCES, seen_at
 
@@ -48,7 +49,7 @@ def trace(locus: AbstractBifurcationTracer, place: Place, max_step: float, max_p
     while len(out.spots) < max_points:
         try:
             after = locus.place(locus.step(place, length), place.along, place.heading)
-            turn = float(np.arccos(np.clip(place.along @ after.along, -1, 1)))
+            turn = float(turn_between(place.along, after.along))
             if turn > TURNED:
                 raise ArithmeticError("it turns too much")
             found = _met(locus, place, after, length)
@@ -73,8 +74,7 @@ def trace(locus: AbstractBifurcationTracer, place: Place, max_step: float, max_p
             out.closed = True
             return out
         out.spots.append(after.spot)
-        speed = float(np.max(np.abs(after.along) / np.maximum(1, np.abs(after.spot.look.u))))
-        length = min(max_step / speed, length * float(np.clip(TURN / max(turn, 1e-9), 0.5, 2)))
+        length = float(next_length(length, turn, after.along, after.spot.look.u, max_step))
         place = after
     out.why = f"max_points = {max_points}"
     return out

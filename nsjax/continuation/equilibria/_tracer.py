@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from .._step_length import FIRST, next_length, SHORTEST, turn_between, TURNED
 from ._bifurcation import unstable_number
 from ._branch import BranchSegment, CLOSED
 from ._corner import active, fold_at, hopf_at
@@ -28,7 +29,6 @@ from ._corrector import (
 from ._equations import EITHER, EquilibriumCurve, Record
 
 
-FIRST, LEAST = 1e-3, 1e-9  # steps, in units of the interval
 TURN = 0.1  # the angle between tangents that is aimed at
 SIDE = 1e-11  # distance from a surface that counts as on its wrong side
 DOUBLE = 1e-9  # value of a test function, relative to that at the ends of a step, that counts as a double zero
@@ -65,16 +65,16 @@ class Tracer:
         length, traced = FIRST, jnp.asarray(mode)
         while len(segment.records) < self.max_points:
             step = step_along(self.curve, u, tangent, jnp.asarray(length), traced)
-            turn = float(np.arccos(np.clip(float(tangent @ step.tangent), -1, 1))) if step.good else np.inf
+            turn = float(turn_between(*map(np.asarray, (tangent, step.tangent)))) if step.good else np.inf
             zeros = self.zeros(step, u, tangent, mode, length) if step.good else None
-            if turn > 0.5 and zeros is not None:
+            if turn > TURNED and zeros is not None:
                 # Beyond a surface the equations may have a kink that no switch tells of; up to it they are smooth.
                 zeros = zeros if zeros and zeros[-1].which >= GUARDS else None
             if zeros == [] and length > UNSEEN and self.changed(segment.records[-1], step.record):
                 zeros = None
             if zeros is None:
                 length /= 2
-                if length < LEAST:
+                if length < SHORTEST:
                     on = np.flatnonzero(active(self.curve, u, mode))
                     if len(on):
                         # There is no way past the surface with this side's equations: one ends on it.
@@ -94,9 +94,7 @@ class Tracer:
                 return step.u, step.tangent
             u, tangent = step.u, step.tangent
             segment.add(step.record, mode)
-            # No component changes by more than `max_step` of its unit, or of what it is if that is more.
-            speed = float(jnp.max(jnp.abs(tangent) / jnp.maximum(1, jnp.abs(u))))
-            length = min(self.max_step / speed, length * float(np.clip(TURN / max(turn, 1e-9), 0.5, 2)))
+            length = float(next_length(length, turn, *map(np.asarray, (tangent, u)), self.max_step, TURN))
         segment.end = f"max_points = {self.max_points}, {self.name} = {self.value(u):.6g}"
         return u, tangent
 

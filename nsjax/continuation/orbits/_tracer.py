@@ -11,6 +11,7 @@ from ..._numerics._bracket import bracketed
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import OrbitItinerary
 from ...orbits.segments._point import correct, Plane, PointData, state_at
+from .._step_length import FIRST, next_length, SHORTEST, turn_between, TURNED
 from ._test_functions import (
     BRANCH,
     branch_value,
@@ -25,9 +26,7 @@ from ._test_functions import (
 
 
 LAST_FOUND = "the last orbit that could be found"
-FIRST, SHORTEST = 1e-3, 1e-9  # steps, in units of the curve
 UNSEEN = 1e-6  # steps that are not shortened any more for the sake of a branch point
-TURN, TURNED = 0.15, 0.5  # the angles between tangents that are aimed at, and allowed
 NEAR = 1e-5  # zeros that are nearer to each other, in steps, are one
 ON = 1e-11  # an orbit of which a test function is smaller in size is on the corner, on whichever side of it by rounding
 VANISHES = 1e-6  # a test function that is smaller, where another one vanishes
@@ -183,7 +182,7 @@ class OrbitTracer:
             step = self.at(spot, length)
             turn = np.inf
             if step is not None:
-                turn = float(np.arccos(np.clip(float(spot.look.tangent @ step.look.tangent), -1, 1)))
+                turn = float(turn_between(spot.look.tangent, step.look.tangent))
             zeros = self.zeros(spot, step, length) if step is not None and turn <= TURNED else None
             if step is not None and zeros is not None:
                 break
@@ -196,8 +195,7 @@ class OrbitTracer:
         steps = trace.steps + 1
         if trace.begin is not None and steps > 3 and self.passes(trace.begin, spot, step):
             return dataclasses.replace(trace, ahead=(*zeros, trace.begin), closed=True)
-        speed = float(np.max(np.abs(step.look.tangent) / np.maximum(1, np.abs(step.look.u))))
-        length = min(self.max_step / speed, length * float(np.clip(TURN / max(turn, 1e-9), 0.5, 2)))
+        length = float(next_length(length, turn, step.look.tangent, step.look.u, self.max_step))
         return dataclasses.replace(trace, ahead=(*zeros, step), length=length, steps=steps)
 
     def passes(self, begin: OrbitPoint, spot: OrbitPoint, step: OrbitPoint) -> bool:

@@ -19,6 +19,7 @@ from ..._numerics._series import Coefficient, Series
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
+from ...system._sliding import linearised, multipliers
 from ._stepper import jittered, Step, Stepper, unresolved, Watched, with_multipliers
 
 
@@ -180,8 +181,9 @@ class TaylorStepper(Stepper):
             held = row([model.held(k, state.mode[k]) for k in which])
             # In every order the unknown coefficient of λ is multiplied by the matrix at the start alone: one inverse
             # serves for all orders, where solving anew would take as many linear systems as there are terms.
-            slope, units = model.linearised(t, y, state, s).slope, row(jnp.eye(len(which), dtype=t.dtype))
-            inverse = jnp.stack(list(jax.vmap(model.multipliers, in_axes=(None, 0, None))(slope, units, held)))
+            slope, units = linearised(model, t, y, state, s).slope, row(jnp.eye(len(which), dtype=t.dtype))
+            solved = jax.vmap(ft.partial(multipliers, model), in_axes=(None, 0, None))(slope, units, held)
+            inverse = jnp.stack(list(solved))
             inverse = inverse if isinstance(units, list) else inverse.T
 
         def fn(t: Scalar, *args: Array) -> list[Array]:

@@ -11,8 +11,8 @@ from ...._types import Scalar
 from ....orbits.segments._equations import OrbitCurve
 from ....orbits.segments._itinerary import OrbitItinerary
 from ....orbits.segments._point import corrected, Plane, PointData
+from ..._step_length import FIRST, next_length, SHORTEST, turn_between, TURNED
 from .._test_functions import BRANCH, branch_value, CIRCLE, circle_values, corner_tests, corner_values, PASSED, Test
-from .._tracer import FIRST, SHORTEST, TURN, TURNED
 
 
 TRIES = 40  # to locate one zero
@@ -181,13 +181,12 @@ def _between(lane: Lane) -> Scalar:
 
 
 def _length(lane: Lane, here: Place, max_step: Array) -> Scalar:
-    turn = jnp.arccos(jnp.clip(lane.at.tangent @ here.tangent, -1, 1))
-    speed = jnp.max(jnp.abs(here.tangent) / jnp.maximum(1, jnp.abs(here.u)))
-    return jnp.minimum(max_step / speed, lane.length * jnp.clip(TURN / jnp.maximum(turn, 1e-9), 0.5, 2))
+    turn = turn_between(lane.at.tangent, here.tangent)
+    return next_length(lane.length, turn, here.tangent, here.u, max_step)
 
 
 def _stepped(lane: Lane, here: Place, good: Array, ends: Array, max_step: Array) -> Lane:
-    turn = jnp.arccos(jnp.clip(lane.at.tangent @ here.tangent, -1, 1))
+    turn = turn_between(lane.at.tangent, here.tangent)
     good = good & (turn <= TURNED) & jnp.all(jnp.isfinite(here.values))
     before, after = lane.at.values, here.values
     changed = jnp.where(ends, (before > 0) & (after <= 0), before * after < 0)
