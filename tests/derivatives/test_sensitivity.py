@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import Circle, flat, impact, Motion, pid, Plane, Touch
+from models import CHEAP, Circle, flat, impact, Motion, pid, Plane, Touch
 
 from nsjax import gallery, RESULTS, sensitivity, solve
 
@@ -19,7 +19,7 @@ def touch(system):
     """State at t = 3, without a wall (cos t, -sin t); the wall is touched if `gap` <= 0."""
 
     def end(system):
-        options = dict(solver=dfx.Dopri8(), stepsize_controller=pid(1e-12), throw=False)
+        options = dict(stepsize_controller=pid(1e-12), throw=False)
         sol = solve(system, -np.pi, 3.0, Motion(-1.0, 0.0), **options)
         return jnp.stack(sol.y1), sol
 
@@ -47,7 +47,7 @@ def test_itineraries_of_many():
     """In a batch, and with logs of different sizes."""
 
     def path(v, max_events):
-        sol = solve(gallery.StickSlip(v_dr=v), 0.0, 20.0, Motion(2.5, -0.5), max_events=max_events)
+        sol = solve(gallery.StickSlip(v_dr=v), 0.0, 20.0, Motion(2.5, -0.5), max_events=max_events, **CHEAP)
         return sol.itinerary
 
     v = jnp.asarray([0.3, 0.31, 0.9])

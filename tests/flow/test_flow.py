@@ -272,7 +272,7 @@ def test_thermostat():
 
 
 def test_relay_without_hysteresis_is_told():
-    sol = solve(Thermostat(T_high=18.0), 0.0, 10.0, Heat(16.0), throw=False)
+    sol = solve(Thermostat(T_high=18.0), 0.0, 10.0, Heat(16.0), mode={"heater": 1}, throw=False)
     assert sol.result == RESULTS.stuck_in_events
 
 

@@ -150,11 +150,11 @@ def test_every_lane_has_its_own_result():
 
 
 def test_map_in_batches_and_nested_vmap():
-    v, x = lanes(12)
+    v, x = lanes(64)
     batch = many()(v, x)
-    chunks = jax.jit(lambda v, x: lax.map(lambda p: one(*p), (v, x), batch_size=4))(v, x)
-    nested = jax.jit(jax.vmap(jax.vmap(one)))(v.reshape(3, 4), x.reshape(3, 4))
-    for other in (chunks, jax.tree.map(lambda a: a.reshape(12, *a.shape[2:]), nested)):
+    chunks = jax.jit(lambda v, x: lax.map(lambda p: one(*p), (v, x), batch_size=16))(v, x)
+    nested = jax.jit(jax.vmap(jax.vmap(one)))(v.reshape(8, 8), x.reshape(8, 8))
+    for other in (chunks, jax.tree.map(lambda a: a.reshape(64, *a.shape[2:]), nested)):
         assert np.array_equal(other[2], batch[2])
         for a, b in zip(jax.tree.leaves(other), jax.tree.leaves(batch), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
