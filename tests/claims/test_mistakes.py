@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array
-from models import Motion, pid
+from models import CHEAP, Motion, pid
 
 import nsjax
 from nsjax import gallery, solve, SolveError
@@ -227,7 +227,7 @@ def test_printed():
     text = str(sol)
     assert len(text.splitlines()) <= 14 and "x = " in text and "belt: belt -1 -> +0" in text and " more ..." in text
     assert repr(sol) == text and "<pre>" in sol._repr_html_() and "&gt;" in sol._repr_html_()
-    many = jax.vmap(lambda x: solve(BELT, 0.0, 40.0, Motion(x, 0.0 * x)))(jnp.asarray([1.0, 2.5]))
+    many = jax.vmap(lambda x: solve(BELT, 0.0, 40.0, Motion(x, 0.0 * x), **CHEAP))(jnp.asarray([1.0, 2.5]))
     assert str(many).startswith("2 solutions of StickSlip") and "2 successful" in str(many)
     low, high = sorted(int(n) for n in many.events.num)
     assert str(many.events) == f"event logs of 2 solutions, {low} to {high} events each"
