@@ -4,13 +4,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.flatten_util as jfu
+import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
 from ..._numerics._compile import interactive
 from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, RESOLVED
-from ..._numerics._root import find_root, Newton
+from ..._numerics._root import Newton
 from ..._types import Scalar
 from ...derivatives._floquet import floquet, structural_zeros
 from ...system._model import SwitchedSystem
@@ -122,28 +123,64 @@ def corrected(
 ) -> PointData:
     """`correct`, within a program; without `turns` the largest and least states are those at the nodes."""
     origin, border, distance = plane
+    method, m = Newton(TOLERANCE, 10), curve.dimension
 
-    def residual(u: Array, _: Any) -> Array:
-        off = jnp.append(curve.residual(u, itinerary, origin)[0], border @ (u - origin) - distance)
-        return jnp.where(newton, off, u - guess)
+    def turn(c: _Turn) -> _Turn:
+        u, linear = c.next, _linear(curve, itinerary, c.next, origin)
+        off = jnp.append(linear.f, border @ (u - origin) - distance)
+        step = method.step(u, off, jnp.concatenate([linear.df, jnp.atleast_2d(border)]))
+        new, ended, good = (jnp.where(c.ended, old, now) for old, now in zip((u, True, c.good), step))
+        return _Turn(u, new, linear, ended, good, over=c.ended, count=c.count + 1)
 
-    u, good = find_root(residual, guess, None, Newton(TOLERANCE, 10))
-    return look_at(curve, itinerary, u, good, plane, turns)
+    # The last turn has the derivatives at the root, which all that is seen of it begins with: so the equations stand
+    # in the program once.
+    size, rows, n = len(guess), len(itinerary.slot), len(curve.sizes)
+    blank = _Linear(*(jnp.zeros(shape, guess.dtype) for shape in ((size - m,), (rows, n), (size - m, size), (size,))))
+    no = jnp.zeros((), bool)
+    first = _Turn(guess, guess, blank, ended=~jnp.asarray(newton), good=no, over=no, count=jnp.zeros((), jnp.int32))
+    last = lax.while_loop(lambda c: ~c.over & (c.count <= method.max_iterations), turn, first)
+    return _seen(curve, itinerary, last.u, last.linear, last.good, plane, turns)
 
 
-def look_at(
-    curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, good: Bool[Array, ""], plane: Plane, turns: bool
-) -> PointData:
-    origin, border, _ = plane
-    begin, end, x, value = curve.parts(u)
-    n, rows, m = len(curve.sizes), len(begin), curve.dimension
-    model = curve.model.with_parameter(curve.path, value)
+class _Linear(NamedTuple):
+    """The equations and the states at the ends of the segments; the derivatives of the equations, and of the time at
+    which the last segment ends."""
 
+    f: Array
+    last: Array
+    df: Array
+    closing: Array
+
+
+class _Turn(NamedTuple):
+    """Of Newton's method: where it is, and where it goes next."""
+
+    u: Array
+    next: Array
+    linear: _Linear  # at u
+    ended: Bool[Array, ""]  # whether `next` is where it ends
+    good: Bool[Array, ""]
+    over: Bool[Array, ""]  # whether u is
+    count: Array
+
+
+def _linear(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, origin: Array) -> _Linear:
     def equations(u: Array) -> tuple[tuple[Array, Scalar], tuple[Array, Array]]:
         f, arrival, last = curve.residual(u, itinerary, origin)
         return (f, arrival), (f, last)
 
     (df, closing), (f, last) = jax.jacfwd(equations, has_aux=True)(u)
+    return _Linear(f, last, df, closing)
+
+
+def _seen(
+    curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, linear: _Linear, good: Array, plane: Plane, turns: bool
+) -> PointData:
+    """All that is seen of a point."""
+    begin, end, x, value = curve.parts(u)
+    n, rows, m = len(curve.sizes), len(begin), curve.dimension
+    model = curve.model.with_parameter(curve.path, value)
+    border, (f, last, df, closing) = plane.normal, linear
     scaled = df / row_sizes(df)[:, None]
     whole = jnp.concatenate([scaled, jnp.atleast_2d(border)])
     along = jnp.linalg.solve(whole, jnp.eye(len(u), m, m - len(u), dtype=u.dtype)).T
