@@ -56,7 +56,9 @@ def exact():
     return np.array([*ref.y, *events[:3]]), derivative, len(events)
 
 
-@pytest.mark.parametrize("solver, order", [(dfx.Tsit5(), 5), (dfx.Dopri5(), 5), (dfx.Dopri8(), 8)])
+@pytest.mark.parametrize(
+    "solver, order", [(dfx.Tsit5(), 5), pytest.param(dfx.Dopri5(), 5, marks=pytest.mark.slow), (dfx.Dopri8(), 8)]
+)
 def test_errors_fall_with_the_tolerance(solver, order, exact):
     """State, event times and their derivatives by state and parameters after thirty events: the error falls as the
     tolerance (and so as the length of the steps to the power of the order), down to 1e-11; pitfall 19."""

@@ -56,7 +56,10 @@ def fuzz(name: str, number: int, seed: int, derive: bool) -> tuple[collections.C
     return count(truths, Solved(*out), (name, seed))
 
 
-@pytest.mark.parametrize("name", ["friction", "corners", "relays"])
+QUICK = ("friction", "corners", "relays")
+
+
+@pytest.mark.parametrize("name", QUICK)
 def test_random_systems(name):
     tally, wrong = fuzz(name, 80, 0, derive=name == "friction")
     assert not wrong
@@ -79,7 +82,7 @@ def test_many_random_systems(name, derive):
     assert told_but_ambiguous(tally) == 0 and share(tally, "needlessly told") <= 0.1
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n not in QUICK)) for n in SHAPES])
 def test_the_oracle_against_itself(name):
     """Its derivatives, by saltation matrices, are those of its solutions."""
     shape = SHAPES[name][0]
