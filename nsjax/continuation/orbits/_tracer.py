@@ -271,14 +271,21 @@ class OrbitTracer:
     def up_to_end(self, spot: OrbitPoint, found: list[Zero], near: float) -> list[Zero]:
         """The zeros up to the first at which the itinerary ends, with all that vanishes there."""
         end = next(i for i, zero in enumerate(found) if zero.test.kind not in PASSED)
-        last = self.with_others(
-            spot, found[end], [z for z in found if abs(z.s - found[end].s) < near and z is not found[end]]
-        )
+        others = [z for z in found if z is not found[end] and self.together(found[end], z, near)]
+        last = self.with_others(spot, found[end], others)
         out = found[:end]
         if last.test.kind in (*CORNERS, "branch"):
             # A test function may pass its zero together with the corner's; it is the corner's then.
             out = [z for z in out if last.s - z.s > near]
         return [*out, last]
+
+    def together(self, zero: Zero, other: Zero, near: float) -> bool:
+        """Whether two zeros are one. Beside a segment that vanishes a guard does so with a power of its duration, and
+        where is known the less: what is zero at the other one too was found too soon."""
+        if abs(other.s - zero.s) < near:
+            return True
+        least = other.spot.look.least[zero.test.row, zero.test.slot]
+        return zero.test.kind == "guard" and other.test.kind in CORNERS and abs(float(least)) < ON
 
     def short_of(self, spot: OrbitPoint, zero: Zero, off: float) -> tuple[float, OrbitPoint]:
         """The point a given distance before a zero on the way from another point; or the zero."""
