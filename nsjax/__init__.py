@@ -27,7 +27,6 @@ from .continuation import (
     continue_equilibrium as continue_equilibrium,
     continue_orbit as continue_orbit,
     continue_orbits as continue_orbits,
-    hopf_orbits as hopf_orbits,
     OrbitBranch as OrbitBranch,
     OrbitContinuation as OrbitContinuation,
 )
@@ -59,10 +58,5 @@ from .maps import (
 )
 from .orbits import find_orbit as find_orbit, find_orbits as find_orbits, Orbit as Orbit, Segment as Segment
 from .regularise import banded as banded, mark_kinks as mark_kinks, smoothed as smoothed
-from .setvalued import (
-    eigenvalue_crossings as eigenvalue_crossings,
-    eigenvalue_path as eigenvalue_path,
-    generalized_jacobian as generalized_jacobian,
-)
 from .sweeps import sweep as sweep
 from .system import clock as clock, impact as impact, relay as relay, sgn as sgn, System as System

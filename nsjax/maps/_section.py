@@ -184,13 +184,13 @@ def poincare_map(
     direction: int = 1,
     number: int = 1,
     iterates: int | None = None,
-    max_time: Any = None,
     t0: Any = 0.0,
     mode: Any = None,
     solver: dfx.AbstractSolver = dfx.Tsit5(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     max_steps: int = 4096,
     max_events: int = 256,
+    max_time: Any = None,
     adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
     throw: bool = True,
 ) -> Iterate:
@@ -221,9 +221,9 @@ def poincare_map(
         that side, and 0 for all of its events; of a relay 1 where it switches on, -1 off; of an impact 1 or 0.
     - `number`: which crossing, counted from 1: that power of the map.
     - `iterates`: how many iterates, which then have a leading axis; by default one, without.
-    - `max_time`: how long each return may take [time]; forced systems: by default a hundred periods.
     - `t0`, `mode`, `solver`, `stepsize_controller`, `max_events`, `adjoint`: as for `solve`. `max_steps`: for each
         return.
+    - `max_time`: how long each return may take [time]; forced systems: by default a hundred periods.
     - `throw`: whether a failure raises; if not, look at `Iterate.result`, which has one entry a lane under `vmap`.
 
     **Returns:** an `Iterate`: time, state and mode at the crossing. Its result is `RESULTS.tangential_event`, which is

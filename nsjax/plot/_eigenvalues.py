@@ -21,7 +21,7 @@ def eigenvalue_path(path: EigenvaluePath, *, ax: "Axes | None" = None, labels: L
 
     **Arguments:**
 
-    - `path`: from `nsjax.eigenvalue_path`.
+    - `path`: from `nsjax.setvalued.eigenvalue_path`.
     - `ax`: where to draw; by default a new figure.
     - `labels`: for the axes, as `{"Re": "Re λ [1/s]", "Im": "Im λ [1/s]"}`; by default without units.
 

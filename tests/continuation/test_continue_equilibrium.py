@@ -628,7 +628,7 @@ def test_orbits_born_at_a_hopf_point():
     """(5.25): radius √d and period 2π/(ω + β d), above only."""
     system = gallery.Hopf(-1.0)
     (b,) = continue_equilibrium(system, Plane(0.1, 0.0), "mu", (-1.0, 1.0)).bifurcations
-    below, above = nsjax.hopf_orbits(system, b, [0.25, 0.5])
+    below, above = nsjax.continuation.hopf_orbits(system, b, [0.25, 0.5])
     assert below == [] and len(above) == 1
     (family,) = above
     np.testing.assert_allclose([orbit.period for orbit in family], [2 * np.pi / 1.25, 2 * np.pi / 1.5], rtol=1e-9)
@@ -636,16 +636,18 @@ def test_orbits_born_at_a_hopf_point():
     told = b.with_orbits(below, above)
     assert told.evidence == "both" and told.criticality == "supercritical" and "periodic orbits 0 -> 1" in str(told)
     with pytest.raises(ValueError, match="`distance` must be positive"):
-        nsjax.hopf_orbits(system, b, -0.1)
+        nsjax.continuation.hopf_orbits(system, b, -0.1)
     with pytest.raises(ValueError, match="must be a Hopf bifurcation, but is: saddle-node"):
-        nsjax.hopf_orbits(system, dataclasses.replace(b, kind="saddle-node", period=None, criticality=None), 0.1)
+        nsjax.continuation.hopf_orbits(
+            system, dataclasses.replace(b, kind="saddle-node", period=None, criticality=None), 0.1
+        )
 
 
 def test_orbits_born_subcritically():
     """α = 1: the unstable orbit of radius √d is below."""
     system = gallery.Hopf(-1.0, alpha=1.0)
     (b,) = continue_equilibrium(system, Plane(0.1, 0.0), "mu", (-1.0, 1.0)).bifurcations
-    below, above = nsjax.hopf_orbits(system, b, 0.25, sizes=[0.45, 0.6])
+    below, above = nsjax.continuation.hopf_orbits(system, b, 0.25, sizes=[0.45, 0.6])
     assert above == [] and len(below) == 1 and not below[0][0].stable
     np.testing.assert_allclose(below[0][0].period, 2 * np.pi / 1.25, rtol=1e-9)
 
@@ -655,7 +657,7 @@ def test_orbits_born_at_a_discontinuous_hopf_point():
     """(5.29): radius d, period 2π, above only, and a multiplier exp(-2π)."""
     system = gallery.DiscontinuousHopf(-1.0)
     (b,) = continue_equilibrium(system, Plane(0.0, 0.0), "mu", (-1.0, 1.0)).bifurcations
-    below, above = nsjax.hopf_orbits(system, b, [0.5, 1.0])
+    below, above = nsjax.continuation.hopf_orbits(system, b, [0.5, 1.0])
     assert below == [] and len(above) == 1
     np.testing.assert_allclose([np.hypot(*orbit.y0) for orbit in above[0]], [0.5, 1.0], rtol=1e-9)
     np.testing.assert_allclose([orbit.period for orbit in above[0]], 2 * np.pi, rtol=1e-9)

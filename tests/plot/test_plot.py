@@ -326,7 +326,7 @@ def test_bifurcation_diagram():
     """Stable and unstable stretches end where they should; points are named; orbits are grey."""
     system = gallery.Hopf(-1.0)
     branch = nsjax.continue_equilibrium(system, gallery.Plane(0.0, 0.0), "mu", (-1.0, 1.0))
-    _, above = nsjax.hopf_orbits(system, branch.bifurcations[0], [0.25, 0.5], sizes=[0.5])
+    _, above = nsjax.continuation.hopf_orbits(system, branch.bifurcations[0], [0.25, 0.5], sizes=[0.5])
     ax = plot.bifurcation_diagram(branch, orbits=above, labels={"mu": "μ [-]", "x1": "x [m]"})
     assert ax.get_xlabel() == "μ [-]" and ax.get_ylabel() == "x [m]"
     lines = {line.get_label(): line for line in ax.lines}

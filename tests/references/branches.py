@@ -78,7 +78,9 @@ def special_at(kind, value, before, after=None, **changes):
     """A corner from one pair of multipliers to another, or a smooth point."""
     matrices = np.diag(before), np.diag(before if after is None else after)
     finite = np.all(np.isfinite(matrices))
-    crossings = nsjax.eigenvalue_crossings(*matrices, multipliers=True) if after is not None and finite else []
+    crossings = (
+        nsjax.setvalued.eigenvalue_crossings(*matrices, multipliers=True) if after is not None and finite else []
+    )
     sides = tuple(np.array(sorted(np.diag(m), key=lambda z: -abs(z)), complex) for m in matrices)
     fields = dict(
         kind=kind, discontinuous=after is not None, criticality=None, evidence="both", by_count=kind, by_crossing=None,

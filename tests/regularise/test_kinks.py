@@ -102,14 +102,16 @@ def test_section_5_7():
     """The generalized Jacobian of the gallery's text, and where its eigenvalues cross (5.36)."""
     sides = []
     for mu in (-1.0, 0.0, 1.0):
-        found = nsjax.generalized_jacobian(mark_kinks(Plain(mu), ORIGIN), ORIGIN, parameter="mu")
-        known = nsjax.generalized_jacobian(gallery.HopfPitchfork(mu), ORIGIN, parameter="mu")
+        found = nsjax.setvalued.generalized_jacobian(mark_kinks(Plain(mu), ORIGIN), ORIGIN, parameter="mu")
+        known = nsjax.setvalued.generalized_jacobian(gallery.HopfPitchfork(mu), ORIGIN, parameter="mu")
         order = dict(zip(("left", "right", "below", "above"), ("abs_1", "abs_2", "abs_3", "abs_4")))
         assert found.surfaces == tuple(order[name] for name in known.surfaces)
         np.testing.assert_array_equal(found.vertices, known.vertices)
         np.testing.assert_array_equal(found.by_parameter, known.by_parameter)
         sides.append(found.vertices)
-    np.testing.assert_allclose([c.q for c in nsjax.eigenvalue_crossings(sides[0], sides[2])], [0.25, 0.75], atol=1e-14)
+    np.testing.assert_allclose(
+        [c.q for c in nsjax.setvalued.eigenvalue_crossings(sides[0], sides[2])], [0.25, 0.75], atol=1e-14
+    )
 
 
 def test_smoothed():

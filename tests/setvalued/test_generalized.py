@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from models import Motion
 
-from nsjax import eigenvalue_crossings, gallery, generalized_jacobian
+from nsjax import gallery
+from nsjax.setvalued import eigenvalue_crossings, generalized_jacobian
 
 
 def test_section_5_7():

@@ -32,7 +32,7 @@ def hopf_orbits(
 
     ```python
     (hopf,) = [b for b in branch.bifurcations if "Hopf" in b.kind]
-    below, above = nsjax.hopf_orbits(system, hopf, [0.1, 0.2, 0.4])
+    below, above = nsjax.continuation.hopf_orbits(system, hopf, [0.1, 0.2, 0.4])
     print(hopf.with_orbits(below, above))
     ```
 
