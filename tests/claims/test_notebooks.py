@@ -2,6 +2,7 @@
 
 import pathlib
 
+import jax
 import pytest
 
 
@@ -11,10 +12,14 @@ NOTEBOOKS = sorted((pathlib.Path(__file__).parents[2] / "notebooks").glob("*.ipy
 @pytest.mark.notebook
 @pytest.mark.filterwarnings("default")  # those of the machinery around the kernel are not ours
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs(path):
+def test_notebook_runs(path, monkeypatch):
     import nbformat
     from nbclient import NotebookClient
 
+    # What the tests have compiled, or another notebook, is not compiled again.
+    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder))
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
     notebook = nbformat.read(path, as_version=4)
     NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(path.parent)}}).execute()
     codes = [cell for cell in notebook.cells if cell.cell_type == "code"]
