@@ -49,14 +49,31 @@ def with_room(integrator: Integrator, dtype: Any) -> Integrator:
     return integrator._replace(max_events=3 * integrator.max_events).with_arrays(dtype)
 
 
-@interactive
 def flow_map(
     system: System, t0: Scalar, t1: Scalar, y0: Y, mode: Any, integrator: Integrator, directions: Directions
 ) -> tuple[Solution, Float[Array, "directions n"]]:
     """The solution from t0 to t1, with dense output, and the derivatives of the state at its end. Nothing else of the
     solution has derivatives."""
     numbers, rest = eqx.partition(system, eqx.is_inexact_array)
+    where = (t0, t1, y0, mode, integrator, directions)
+    sol, tangents = _flow_map(numbers, rest, *where)
+    lost = ~np.isfinite(tangents).all() and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(sol.y1))
+    if not lost:
+        return sol, tangents
+    # The derivative by a parameter may be infinite (of sqrt(c) at c = 0, of x**n by n at x < 0), and zero times it is
+    # not a number. A program of its own leaves out the parameters that do not move.
+    moves = jax.tree.map(
+        lambda _, leaf: leaf is not None and bool(np.any(leaf)), system, directions.system, is_leaf=lambda x: x is None
+    )
+    numbers, rest = eqx.partition(system, moves)
+    directions = directions._replace(system=eqx.filter(directions.system, moves))
+    return _flow_map(numbers, rest, *where[:-1], directions)
 
+
+@interactive
+def _flow_map(
+    numbers: Any, rest: Any, t0: Scalar, t1: Scalar, y0: Y, mode: Any, integrator: Integrator, directions: Directions
+) -> tuple[Solution, Float[Array, "directions n"]]:
     def flow(t0: Scalar, t1: Scalar, y0: Y, numbers: Any) -> tuple[Array, Solution]:
         saveat, model = dfx.SaveAt(dense=True), eqx.combine(numbers, rest)
         sol = integrate(model, t0, t1, y0, integrator, mode=mode, saveat=saveat, still=True)

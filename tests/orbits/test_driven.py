@@ -74,3 +74,37 @@ def test_events_beyond_the_bound():
     assert orbit.events.t.shape == (2,) and int(orbit.events.num) == 2
     failed = find_orbit(system, Motion(2.02, 0.0), period=13.54, max_events=1, method="shooting", throw=False)
     assert failed.result == nsjax.RESULTS.orbit_not_found
+
+
+class Powers(nsjax.System):
+    """A spring of the power p, with an amplitude sqrt(a): at x < 0 and a = 0 what they make has no derivative by p, a."""
+
+    p: float = 3.0
+    a: float = 0.0
+    count: int = 1
+
+    def vector_field(self, t, y, s):
+        force = jnp.cos(1.3 * t) - jnp.sqrt(self.a) - jnp.power(y.x, self.p) - 0.1 * s.friction
+        return Motion(y.v, force - 0.3 * self.count * y.v)
+
+    @nsjax.sgn
+    def friction(self, t, y):
+        return y.v
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / 1.3
+
+
+def test_a_parameter_by_which_nothing_can_be_differentiated():
+    """Zero times an infinite derivative is not a number; the derivative by the state is one."""
+    start = Motion(0.1, 0.1)
+    orbit = find_orbit(Powers(), start)
+
+    def state(x):
+        return jnp.stack(nsjax.solve(Powers(), 0.0, Powers().period, Motion(*x)).y1)
+
+    monodromy = jax.jacfwd(state)(jnp.stack(orbit.y0))
+    np.testing.assert_allclose(orbit.monodromy, monodromy, atol=1e-6)
+    # What the search finds within `jit`; where solutions settle is another orbit.
+    np.testing.assert_allclose(np.stack(orbit.y0), [0.923124592128, 1.81383170516], atol=1e-9)
