@@ -21,15 +21,17 @@ except ImportError:  # then nothing is known of the calls around this one
 F = TypeVar("F", bound=Callable[..., Any])
 
 # The older emitters of XLA's CPU compiler take a third to a half off its time. In batches their programs are up to 1.4
-# times slower: those are compiled by the user's own `jax.jit`, or by `nsjax.sweep`, without them.
+# times slower: those are compiled by the user's own `jax.jit`, or by `nsjax.sweep`, without them. Nothing of LLVM's
+# optimisation takes another quarter to a half; what is called for every point of a branch runs a fifth slower by it.
 QUICK = {"xla_cpu_use_fusion_emitters": False}
+QUICKEST = {**QUICK, "xla_backend_optimization_level": 0}
 
 
 @ft.cache
-def _options() -> dict[str, Any]:
-    """Those of `QUICK` that this version of XLA knows."""
+def _options(often: bool) -> dict[str, Any]:
+    """Those that this version of XLA knows."""
     known = {}
-    for name, value in QUICK.items():
+    for name, value in (QUICK if often else QUICKEST).items():
         with contextlib.suppress(Exception):
             jax.jit(lambda x: x).lower(0.0).compile({name: value})
             known[name] = value
@@ -49,15 +51,15 @@ def without_collection() -> Iterator[None]:
             gc.enable()
 
 
-def interactive(fn: F) -> F:
+def interactive(fn: F, often: bool = False) -> F:
     """`equinox.filter_jit` for what a user calls and waits for: compiled quickly, where it is not part of another
-    program."""
+    program; less so if it is called `often`."""
     jit: Any = eqx.filter_jit
     within = jit(fn)
 
     @ft.cache  # not on import: which options there are is found out by compiling
     def alone() -> Any:
-        return jit(fn, compiler_options=_options())
+        return jit(fn, compiler_options=_options(often))
 
     @ft.wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:

@@ -3,9 +3,11 @@
 Written once, in the namespace of its arrays: NumPy's for a branch that Python follows, jax's within a program.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 
+R = TypeVar("R")
 FIRST, SHORTEST = 1e-3, 1e-9  # in units of the curve
 TURN, TURNED = 0.15, 0.5  # the angles between tangents that are aimed at, and allowed
 
@@ -26,3 +28,14 @@ def next_length(length: Any, turn: Any, tangent: Any, u: Any, longest: Any, aim:
     xp = tangent.__array_namespace__()
     speed = xp.max(xp.abs(tangent) / xp.maximum(1, xp.abs(u)))
     return xp.minimum(longest / speed, length * xp.clip(aim / xp.maximum(turn, 1e-9), 0.5, 2))
+
+
+def shortened(length: float, attempt: Callable[[float], R | None]) -> tuple[float, R] | None:
+    """The first of a length and its halves with which a step succeeds, and what it gives; None where even the shortest
+    one does not."""
+    while length >= SHORTEST:
+        found = attempt(length)
+        if found is not None:
+            return length, found
+        length /= 2
+    return None

@@ -19,6 +19,7 @@ class Integrator(NamedTuple):
     max_steps: int = 4096
     max_events: int = 256
     adjoint: dfx.AbstractAdjoint = dfx.ForwardMode()
+    looped: bool = False  # whether the stages of a step are a loop: slower, but half as much to compile
 
     def checked(self, dtype: Any, tolerance: tuple[float, float] = (1e-8, 1e-5)) -> "Integrator":
         """The same with a step size controller and a solver in the form that the loop needs.

@@ -47,7 +47,7 @@ class _Options(NamedTuple):
     still: bool = False  # whether only the state at the end has derivatives
 
 
-@interactive
+@ft.partial(interactive, often=True)
 def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> Solution:
     def run(system: System, t0: Scalar, t1: Scalar, y0: Y) -> Solution:
         return _integrate(system, t0, t1, y0, options)
@@ -70,7 +70,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     start, stop = t0 * direction, t1 * direction
     model = SwitchedSystem(system, direction, start, y0).at(start)
     state, forked, result = start_mode(model, start, y0, options.given, frozen(stop - start))
-    stepper = _stepper(options.integrator.solver).made_for(model, state, start, y0)
+    stepper = _stepper(options.integrator).made_for(model, state, start, y0)
     y0 = model.project(start, y0, state)  # a change of y0 off the surface that holds it changes nothing
     flow = _flow(model, stepper, (start, stop), y0, state, options)
     result = _obstacle(flow, y0, state, options.saveat, result)
@@ -229,10 +229,11 @@ def _solution(flow: Flow, c: Carry, t0: Scalar, first: ModeState, end_wanted: bo
     )
 
 
-def _stepper(solver: Any) -> Stepper:
+def _stepper(integrator: Integrator) -> Stepper:
+    solver = integrator.solver
     if isinstance(solver, Taylor):
         return TaylorStepper(solver)
-    return ExponentialStepper(solver) if isinstance(solver, Exponential) else RungeKutta(solver)
+    return ExponentialStepper(solver) if isinstance(solver, Exponential) else RungeKutta(solver, integrator.looped)
 
 
 def _strong(x: Any) -> Any:

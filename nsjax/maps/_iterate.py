@@ -1,6 +1,7 @@
 """Maps of a solution onto itself, applied over and over: Poincaré maps and what they give."""
 
 import abc
+import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -127,7 +128,7 @@ class PoincareMap(eqx.Module):
         return (start.t, start.y, start.mode, start.result), step
 
 
-@interactive
+@ft.partial(interactive, often=True)
 def _apply(
     step: PoincareMap, system: System, t0: Scalar, y0: Y, given: dict[str, Any], number: int | None, each: int
 ) -> Iterate:

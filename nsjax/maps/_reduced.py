@@ -1,5 +1,6 @@
 """The reduced map of Fig. 6.23: of one component of the state, the others being periodic."""
 
+import functools as ft
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -131,7 +132,7 @@ class _Span(NamedTuple):
     integrator: Integrator
 
 
-@interactive
+@ft.partial(interactive, often=True)
 def _reduced(
     parameters: tuple[System, Scalar, Scalar], guess: Y, place: int, span: _Span, newton: Newton
 ) -> ReducedIterate:

@@ -8,14 +8,14 @@ import numpy as np
 
 from ..._numerics._bracket import bracketed
 from ...orbits.segments._equations import linearised
-from .._step_length import FIRST, next_length, SHORTEST, turn_between, TURNED
+from .._step_length import FIRST, next_length, shortened, turn_between, TURNED
+from .._zeros import FAILED, interpolated
 from ..orbits._test_functions import BRANCH, CORNERS, Test
 from ..orbits._tracer import LAST_FOUND, OrbitPoint
 from ..orbits.corners._grazing import cut_itinerary
 from ._surface import AbstractBifurcationTracer, BifurcationTracer, cleared, CUSP, DELTA, Place, RESONANCES, seen_at
 
 
-FAILED = (ArithmeticError, KeyError, np.linalg.LinAlgError)  # where an orbit, or what is asked of it, is not found
 TOGETHER = 1e-3  # zeros that are nearer to each other, in steps, are one
 DEGENERATE = 1e-2  # of the slope of the test function: where it is less, two branches of its zeros cross
 # What vanishes together is told by the first. (At a resonance multipliers also pass 1 or -1.)
@@ -47,18 +47,20 @@ def trace(locus: AbstractBifurcationTracer, place: Place, max_step: float, max_p
     """Follows the curve from a point in the direction that it has there."""
     out, begin, length, steps = Trace([place.spot]), place, FIRST, 0
     while len(out.spots) < max_points:
-        try:
-            after = locus.place(locus.step(place, length), place.along, place.heading)
-            turn = float(turn_between(place.along, after.along))
-            if turn > TURNED:
-                raise ArithmeticError("it turns too much")
-            found = _met(locus, place, after, length)
-        except FAILED:
-            length /= 2
-            if length < SHORTEST:
-                out.why = LAST_FOUND
-                return out
-            continue
+
+        def attempt(length: float, place: Place = place) -> tuple[Place, float, list[Codim2Point]] | None:
+            try:
+                after = locus.place(locus.step(place, length), place.along, place.heading)
+                turn = float(turn_between(place.along, after.along))
+                return None if turn > TURNED else (after, turn, _met(locus, place, after, length))
+            except FAILED:
+                return None
+
+        step = shortened(length, attempt)
+        if step is None:
+            out.why = LAST_FOUND
+            return out
+        length, (after, turn, found) = step
         for met in found:
             # Samples show late that a surface is touched: what lies beyond the exact point is no orbit.
             while met.test.kind == "grazing" and len(out.spots) > 1 and _beyond(out.spots[-1], met.spot, place):
@@ -166,33 +168,15 @@ def _interpolated(
     test: Test,
     value: Callable[[OrbitPoint], float],
 ) -> Codim2Point:
-    """A point at which the equations are singular, by polynomials through points of the curve on both sides of it."""
-    shares, values, spots = [], [], []
-    for share in (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0):
-        try:
-            here = locus.step(place, s + 0.5 * length * share)
-            values.append(value(here))
-        except FAILED:
-            continue
-        shares.append(share)
-        spots.append(here)
-    if len(shares) < 5:
-        raise ArithmeticError("too few points beside a singular one")
-    powers = np.vander(shares, increasing=True)
-    roots = np.polynomial.Polynomial(np.linalg.solve(powers, values)).roots()
-    real = [r.real for r in roots if abs(r.imag) < 1e-6 and abs(r) < 1]
-    if not real:
-        raise ArithmeticError("nothing vanishes there")
-    root = min(real, key=abs)
-    weights = np.linalg.solve(powers.T, root ** np.arange(len(shares)))
-    u = weights @ np.stack([here.look.u for here in spots])
+    """A point at which the equations are singular, from points of the curve on both sides of it."""
+    found = interpolated(s, 0.5 * length, lambda s: locus.step(place, s), value)
+    u = found.at(lambda here: here.look.u)
     spot = seen_at(locus.curve, place.spot.itinerary, u, place.spot.look.tangent)
     # So are the multipliers there a limit, of saltation matrices that are none.
-    monodromy = np.tensordot(weights, np.stack([here.monodromy for here in spots]), axes=1)
+    monodromy = found.at(lambda here: here.monodromy)
     rho = np.linalg.eigvals(monodromy)
     rho = rho[np.argsort(-np.abs(rho))].astype(complex)
-    spot = dataclasses.replace(spot, monodromy=monodromy, multipliers=rho)
-    return Codim2Point(test, (), spot, s + 0.5 * length * root)
+    return Codim2Point(test, (), dataclasses.replace(spot, monodromy=monodromy, multipliers=rho), found.s)
 
 
 def _cut(locus: BifurcationTracer, spot: OrbitPoint, test: Test) -> OrbitPoint | None:

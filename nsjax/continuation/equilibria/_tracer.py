@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._step_length import FIRST, next_length, SHORTEST, turn_between, TURNED
+from .._step_length import FIRST, next_length, shortened, turn_between, TURNED
 from ._bifurcation import unstable_number
 from ._branch import BranchSegment, CLOSED
 from ._corner import active, fold_at, hopf_at
@@ -64,26 +64,22 @@ class Tracer:
         to the end of the branch, which `segment.end` then names."""
         length, traced = FIRST, jnp.asarray(mode)
         while len(segment.records) < self.max_points:
-            step = step_along(self.curve, u, tangent, jnp.asarray(length), traced)
-            turn = float(turn_between(*map(np.asarray, (tangent, step.tangent)))) if step.good else np.inf
-            zeros = self.zeros(step, u, tangent, mode, length) if step.good else None
-            if turn > TURNED and zeros is not None:
-                # Beyond a surface the equations may have a kink that no switch tells of; up to it they are smooth.
-                zeros = zeros if zeros and zeros[-1].which >= GUARDS else None
-            if zeros == [] and length > UNSEEN and self.changed(segment.records[-1], step.record):
-                zeros = None
-            if zeros is None:
-                length /= 2
-                if length < SHORTEST:
-                    on = np.flatnonzero(active(self.curve, u, mode))
-                    if len(on):
-                        # There is no way past the surface with this side's equations: one ends on it.
-                        u = on_surface(self.curve, u, traced, jnp.asarray(on[0]))
-                        segment.add(kept(self.curve, u, traced), mode)
-                        return u, tangent
-                    segment.end = f"the last point that could be found, {self.name} = {self.value(u):.6g}"
-                    return u, tangent
-                continue
+
+            def attempt(length: float, u: Any = u, tangent: Any = tangent) -> tuple[Step, float, list[Zero]] | None:
+                step = step_along(self.curve, u, tangent, jnp.asarray(length), traced)
+                turn = float(turn_between(*map(np.asarray, (tangent, step.tangent)))) if step.good else np.inf
+                zeros = self.zeros(step, u, tangent, mode, length) if step.good else None
+                if turn > TURNED and zeros is not None:
+                    # Beyond a surface the equations may have a kink that no switch tells of; up to it they are smooth.
+                    zeros = zeros if zeros and zeros[-1].which >= GUARDS else None
+                if zeros == [] and length > UNSEEN and self.changed(segment.records[-1], step.record):
+                    zeros = None
+                return None if zeros is None else (step, turn, zeros)
+
+            found = shortened(length, attempt)
+            if found is None:
+                return self.stuck(segment, u, tangent, mode)
+            length, (step, turn, zeros) = found
             for zero in zeros:
                 if zero.which not in (FOLD, PAIR, MARK):
                     return self.stop(segment, zero, tangent, mode)
@@ -96,6 +92,17 @@ class Tracer:
             segment.add(step.record, mode)
             length = float(next_length(length, turn, *map(np.asarray, (tangent, u)), self.max_step, TURN))
         segment.end = f"max_points = {self.max_points}, {self.name} = {self.value(u):.6g}"
+        return u, tangent
+
+    def stuck(self, segment: BranchSegment, u: Any, tangent: Any, mode: np.ndarray) -> tuple[Any, Any]:
+        """Where no step goes on."""
+        on, traced = np.flatnonzero(active(self.curve, u, mode)), jnp.asarray(mode)
+        if len(on):
+            # There is no way past the surface with this side's equations: one ends on it.
+            u = on_surface(self.curve, u, traced, jnp.asarray(on[0]))
+            segment.add(kept(self.curve, u, traced), mode)
+        else:
+            segment.end = f"the last point that could be found, {self.name} = {self.value(u):.6g}"
         return u, tangent
 
     def stop(self, segment: BranchSegment, zero: Zero, tangent: Any, mode: np.ndarray) -> tuple[Any, Any]:

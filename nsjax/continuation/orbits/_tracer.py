@@ -11,7 +11,8 @@ from ..._numerics._bracket import bracketed
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import OrbitItinerary
 from ...orbits.segments._point import correct, Plane, PointData, state_at
-from .._step_length import FIRST, next_length, SHORTEST, turn_between, TURNED
+from .._step_length import FIRST, next_length, shortened, turn_between, TURNED
+from .._zeros import interpolated
 from ._test_functions import (
     BRANCH,
     branch_value,
@@ -175,20 +176,20 @@ class OrbitTracer:
 
     def next_step(self, trace: Trace) -> Trace:
         """The next step along the tangent at the last point, as long as it can be."""
-        spot, length = trace.spots[-1], trace.length
+        spot = trace.spots[-1]
         if len(trace.spots) >= self.max_points:
             return dataclasses.replace(trace, why=f"max_points = {self.max_points}, at {spot.parameter:.10g}")
-        while True:
+
+        def attempt(length: float) -> tuple[OrbitPoint, float, list[Zero]] | None:
             step = self.at(spot, length)
-            turn = np.inf
-            if step is not None:
-                turn = float(turn_between(spot.look.tangent, step.look.tangent))
+            turn = np.inf if step is None else float(turn_between(spot.look.tangent, step.look.tangent))
             zeros = self.zeros(spot, step, length) if step is not None and turn <= TURNED else None
-            if step is not None and zeros is not None:
-                break
-            length /= 2
-            if length < SHORTEST:
-                return dataclasses.replace(trace, why=f"{LAST_FOUND}, at {spot.parameter:.10g}")
+            return None if step is None or zeros is None else (step, turn, zeros)
+
+        found = shortened(trace.length, attempt)
+        if found is None:
+            return dataclasses.replace(trace, why=f"{LAST_FOUND}, at {spot.parameter:.10g}")
+        length, (step, turn, zeros) = found
         zeros = tuple(z for z in zeros if z.test.kind != "Neimark-Sacker" or _complex_pair(z.spot))
         if zeros and zeros[-1].test.kind not in PASSED:
             return dataclasses.replace(trace, ahead=zeros)
@@ -328,34 +329,24 @@ class OrbitTracer:
             s = min(
                 (s for s in seen if s > 0), key=lambda s: abs(test_values(self.curve, seen[s], scale).get(test, np.inf))
             )
-            found = self.interpolate(spot, s, length, chord, scale, test)
-            return None if found is None else Zero(found[0], test, found[1])
+            return self.interpolate(spot, s, length, chord, scale, test)
         return Zero(s, test, seen[s])
 
     def interpolate(
         self, spot: OrbitPoint, s: float, length: float, chord: Any, scale: float, test: Test
-    ) -> tuple[float, OrbitPoint] | None:
-        """A point at which the equations are singular, by polynomials through points beside it."""
-        nodes, spots = [], []
-        for share in (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0):
-            node = s + 0.5 * length * share
-            here = self.at(spot, node, spot.look.u + node / length * chord)
-            if here is not None and test in test_values(self.curve, here, scale):
-                nodes.append(share)
-                spots.append(here)
-        if len(nodes) < 4:
+    ) -> Zero | None:
+        """A point at which the equations are singular, from points beside it."""
+
+        def at(s: float) -> OrbitPoint | None:
+            return self.at(spot, s, spot.look.u + s / length * chord)
+
+        try:
+            found = interpolated(s, 0.5 * length, at, lambda here: self.value(here, test, scale))
+        except ArithmeticError:
             return None
-        powers = np.vander(nodes, increasing=True)
-        values = [self.value(here, test, scale) for here in spots]
-        roots = np.polynomial.Polynomial(np.linalg.solve(powers, values)).roots()
-        real = [r.real for r in roots if abs(r.imag) < 1e-6 and abs(r) < 1]
-        if not real:
-            return None
-        root = min(real, key=abs)
-        weights = np.linalg.solve(powers.T, root ** np.arange(len(nodes)))
-        u = weights @ np.stack([here.look.u for here in spots])
-        found = correct(self.curve, spot.itinerary, Plane(u, spot.look.tangent), newton=False)
-        return s + 0.5 * length * root, spot_of(self.curve, found, spot.itinerary)
+        plane = Plane(found.at(lambda here: here.look.u), spot.look.tangent)
+        look = correct(self.curve, spot.itinerary, plane, newton=False)
+        return Zero(found.s, test, spot_of(self.curve, look, spot.itinerary))
 
 
 def alike(a: OrbitPoint, b: OrbitPoint, curve: OrbitCurve, tolerance: float) -> bool:

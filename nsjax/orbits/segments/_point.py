@@ -1,5 +1,6 @@
 """What is seen of a point of a curve of orbits: its direction, its multipliers, what its guards do along the way."""
 
+import functools as ft
 from typing import Any, NamedTuple
 
 import jax
@@ -108,7 +109,7 @@ def correct(
     return _correct(curve.on(itinerary), itinerary, plane, guess, np.asarray(newton))
 
 
-@interactive
+@ft.partial(interactive, often=True)
 def _correct(curve: OrbitCurve, itinerary: OrbitItinerary, plane: Plane, guess: Array, newton: Array) -> PointData:
     return corrected(curve, itinerary, plane, guess, newton)
 
