@@ -63,7 +63,7 @@ def fundamental_matrix(
     t0, y0, _ = checked_start(system, t0, y0, mode)
     t1 = checked_time("t1", t1, t0.dtype)
     integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, (1e-10, 1e-5))
-    how: dict[str, Any] = dict(mode=mode, throw=throw) | integrator._asdict()
+    how: dict[str, Any] = dict(mode=mode, throw=throw) | integrator.arguments
     flat, unravel = jfu.ravel_pytree(y0)
     times = jnp.asarray([t1] if ts is None else ts, t0.dtype)
     if method == "autodiff":

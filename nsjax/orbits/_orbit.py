@@ -143,7 +143,7 @@ class Orbit(eqx.Module, Generic[StateT]):
         end = self.t0 + periods * self.period
         mode = tuple(self.mode) if self.events.names else None
         return solve(
-            self.system, self.t0, end, self.y0, mode=mode, saveat=saveat, **(self.integrator._asdict() | kwargs)
+            self.system, self.t0, end, self.y0, mode=mode, saveat=saveat, **(self.integrator.arguments | kwargs)
         )
 
     def __str__(self) -> str:

@@ -83,7 +83,7 @@ def perturbation_tube(
 
     times, which = _times(pieces, (x, y), extent, samples)
     ts = np.array([float(orbit.t0), *times, float(orbit.t0 + orbit.period)])
-    how: dict[str, Any] = orbit.integrator._asdict()
+    how: dict[str, Any] = orbit.integrator.arguments
     del how["adjoint"]
     phi = fundamental_matrix(orbit.system, ts[0], ts[-1], orbit.y0, ts=ts, mode=tuple(orbit.mode) or None, **how)
     plane = [names.index(x), names.index(y)]
