@@ -223,7 +223,8 @@ class OrbitContinuation(Generic[StateT]):
 def _with_arguments_of(
     begin: Callable[Arguments, OrbitContinuation[StateT]], fn: Callable[..., Any]
 ) -> Callable[Arguments, OrbitBranch[StateT]]:
-    """A function that hands its arguments on shows them to people and to type checkers, the type of the state too."""
+    """A function that hands its arguments on shows them to people and to type checkers: with both given at once, as
+    otherwise those lose the type of the state."""
     vars(fn)["__signature__"] = inspect.signature(begin).replace(return_annotation=OrbitBranch)
     return fn
 
