@@ -181,7 +181,9 @@ def orbit_branch(
         + tuple((i + keep, b) for i, b in ahead.special if not (common and i == 0)),
     )
     start, stop = piece.points[0], piece.points[-1]
-    if start.admissible and start.spot.parameter > stop.spot.parameter:
+    # Where both ends are the same end of the interval, rounding must not choose.
+    falls = start.spot.parameter - stop.spot.parameter > 1e-9 * float(curve.width)
+    if start.admissible and falls:
         piece, ends = piece.reversed(), ends[::-1]
     spots = [point.spot for point in piece.points]
 
