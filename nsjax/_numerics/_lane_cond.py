@@ -9,11 +9,12 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.core
 import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
-from jax.interpreters import ad, batching, mlir, partial_eval as pe
+from jax.interpreters import ad, batching, mlir
+
+from ._inner import batched_outputs, mapped, moving, opened, pushed_forward, spread, with_zeros
 
 
 _GROUP = 32  # lanes worked on together, at least; a kernel costs as much to start as for some hundred lanes
@@ -28,18 +29,8 @@ def compact_cond(pred: Any, branch: Callable[..., Any], args: Any, default: Any)
     flat, tree = jax.tree.flatten(args)
     closed, out = jax.make_jaxpr(lambda *xs: branch(*jax.tree.unflatten(tree, xs)), return_shape=True)(*flat)
     other = [jnp.asarray(d, o.dtype) for d, o in zip(jax.tree.leaves(default), jax.tree.leaves(out), strict=True)]
-    inputs = [*closed.consts, *flat]
-    results = compact_cond_p.bind(pred, *inputs, *other, jaxpr=jex.ClosedJaxpr(_open(closed), ()))
+    results = compact_cond_p.bind(pred, *closed.consts, *flat, *other, jaxpr=opened(closed))
     return jax.tree.unflatten(jax.tree.structure(out), results)
-
-
-def _open(closed: jex.ClosedJaxpr) -> jex.Jaxpr:
-    """The jaxpr with its constants as its first arguments."""
-    jaxpr = closed.jaxpr
-    names = (*[""] * len(jaxpr.constvars), *jaxpr.debug_info.arg_names)
-    return jaxpr.replace(
-        constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars], debug_info=jaxpr.debug_info._replace(arg_names=names)
-    )
 
 
 def _split(args: Any, jaxpr: jex.ClosedJaxpr) -> tuple[list, list]:
@@ -74,77 +65,36 @@ def _gathered(pred: Any, inputs: list, axes: list, default: list, branch: Callab
     return lax.while_loop(lambda carry: carry[0] < total, work, (jnp.zeros((), jnp.int32), default))[1]
 
 
-def _batched_outputs(jaxpr: jex.ClosedJaxpr, batched: list[bool]) -> list[bool]:
-    """Which outputs depend on the inputs that are batched."""
-    outs = jaxpr.jaxpr.outvars
-    found = []
-    for i in range(len(outs)):
-        _, used = pe.dce_jaxpr(jaxpr.jaxpr, [i == j for j in range(len(outs))])
-        found.append(any(u and b for u, b in zip(used, batched)))
-    return found
-
-
 def _batch(args: Any, dims: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[Any], list[int | None]]:
     size = next(x.shape[d] for x, d in zip(args, dims) if d is not None)
     front = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims)]
-    mapped = [d is not None for d in dims]
+    batched = [d is not None for d in dims]
     pred, (inputs, default) = front[0], _split(front[1:], jaxpr)
-    many, many_default = _split(mapped[1:], jaxpr)
-
-    def spread(x: Any, is_mapped: bool) -> Any:
-        return x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
-
-    def branch(*xs: Any) -> list[Any]:
-        return list(jex.jaxpr_as_fun(jaxpr)(*xs))
-
-    if mapped[0]:
+    many, many_default = _split(batched[1:], jaxpr)
+    branch = jex.jaxpr_as_fun(jaxpr)
+    if batched[0]:
         if not any(many):
-            inputs, many = [spread(x, False) for x in inputs], [True] * len(inputs)
+            inputs, many = [spread(x, size) for x in inputs], [True] * len(inputs)
         axes = [0 if m else None for m in many]
-        out = _gathered(pred, inputs, axes, [spread(x, m) for x, m in zip(default, many_default)], branch)
+        default = [x if m else spread(x, size) for x, m in zip(default, many_default)]
+        out = _gathered(pred, inputs, axes, default, branch)
         return out, [0] * len(out)
-    # All of this axis has work, or none: the branch becomes a batched one. Outputs that do not depend on the batched
-    # inputs (the primals, under `jacfwd`) must stay without the axis.
-    wide = [a or b for a, b in zip(_batched_outputs(jaxpr, many), many_default)]
-
-    def batched(*xs: Any) -> list[Any]:
-        if not any(many):
-            return [spread(x, False) if w else x for x, w in zip(branch(*xs), wide)]
-        results = jax.vmap(branch, in_axes=tuple(0 if m else None for m in many))(*xs)
-        return [x if w else x[0] for x, w in zip(results, wide)]
-
-    default = [spread(x, m) if w else x for x, m, w in zip(default, many_default, wide)]
-    return compact_cond(pred, batched, tuple(inputs), default), [0 if w else None for w in wide]
+    # All of this axis has work, or none: the branch becomes a batched one.
+    wide = [a or b for a, b in zip(batched_outputs(jaxpr, many), many_default)]
+    default = [spread(x, size) if w and not m else x for x, m, w in zip(default, many_default, wide)]
+    return compact_cond(pred, mapped(branch, size, many, wide), inputs, default), [0 if w else None for w in wide]
 
 
 def _jvp(primals: Any, tangents: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[Any], list[Any]]:
     pred, (inputs, default) = primals[0], _split(primals[1:], jaxpr)
     moves, default_moves = _split(tangents[1:], jaxpr)
-    # What has no tangent must not get one: loops on it would have to carry it.
-    smooth = [i for i, move in enumerate(moves) if type(move) is not ad.Zero]
+    smooth = moving(moves)
     kept = [i for i, d in enumerate(default) if jnp.issubdtype(d.dtype, jnp.inexact)]
-    branch = jex.jaxpr_as_fun(jaxpr)
-
-    def both(inputs: list, moves: list) -> tuple[list, list]:
-        def inexact(*xs: Any) -> list:
-            full = list(inputs)
-            for i, x in zip(smooth, xs):
-                full[i] = x
-            return list(branch(*full))
-
-        out, change = jax.jvp(inexact, tuple(inputs[i] for i in smooth), tuple(moves))
-        return out, [change[i] for i in kept]
-
-    out, change = compact_cond(
-        pred,
-        both,
-        (inputs, [moves[i] for i in smooth]),
-        (default, [ad.instantiate_zeros(default_moves[i]) for i in kept]),
-    )
-    full: list[Any] = [ad.Zero(jax.core.ShapedArray(x.shape, jax.dtypes.float0)) for x in out]
-    for i, c in zip(kept, change):
-        full[i] = c
-    return out, full
+    both = pushed_forward(jex.jaxpr_as_fun(jaxpr), len(inputs), smooth, kept)
+    still = [*default, *[ad.instantiate_zeros(default_moves[i]) for i in kept]]
+    results = compact_cond(pred, both, [*inputs, *[moves[i] for i in smooth]], still)
+    out, change = results[: len(default)], results[len(default) :]
+    return out, with_zeros(out, kept, change)
 
 
 def _shapes(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr) -> list[Any]:

@@ -44,9 +44,9 @@ class Directions(NamedTuple):
 
 
 def with_room(integrator: Integrator, dtype: Any) -> Integrator:
-    """The same with room for the events of several periods, where its bound is meant for one; with tolerances that are
-    numbers of the program; and with stages in a loop, as what is called a few times only."""
-    return integrator._replace(max_events=3 * integrator.max_events, looped=True).with_arrays(dtype)
+    """The same with room for the events of several periods, where its bound is meant for one; and with tolerances that
+    are numbers of the program."""
+    return integrator._replace(max_events=3 * integrator.max_events).with_arrays(dtype)
 
 
 def flow_map(

@@ -19,14 +19,11 @@ class Integrator(NamedTuple):
     max_steps: int = 4096
     max_events: int = 256
     adjoint: dfx.AbstractAdjoint = dfx.ForwardMode()
-    looped: bool = False  # whether the stages of a step are a loop: slower, but half as much to compile
 
     @property
     def arguments(self) -> dict[str, Any]:
         """Those of `solve`."""
-        given = self._asdict()
-        del given["looped"]
-        return given
+        return self._asdict()
 
     def checked(self, dtype: Any, tolerance: tuple[float, float] = (1e-8, 1e-5)) -> "Integrator":
         """The same with a step size controller and a solver in the form that the loop needs.

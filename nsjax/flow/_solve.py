@@ -233,7 +233,9 @@ def _stepper(integrator: Integrator) -> Stepper:
     solver = integrator.solver
     if isinstance(solver, Taylor):
         return TaylorStepper(solver)
-    return ExponentialStepper(solver) if isinstance(solver, Exponential) else RungeKutta(solver, integrator.looped)
+    if isinstance(solver, Exponential):
+        return ExponentialStepper(solver)
+    return RungeKutta(solver, isinstance(integrator.adjoint, dfx.RecursiveCheckpointAdjoint))
 
 
 def _strong(x: Any) -> Any:

@@ -115,7 +115,6 @@ def find_orbit(
         check_numbers(system, t0, t0, y0)
     system = arrays_of(system, t0.dtype)
     concrete = known((system, t0, y0, period, jnp.zeros(())))  # (under `jit` not even a constant is)
-    integrator = integrator._replace(looped=concrete)  # a batch of orbits runs faster without
     _check_period(system, t0, y0, period, order, concrete)
     search = Search(
         t0=t0,

@@ -1,8 +1,7 @@
 """One step of a diffrax solver in a fixed mode, and its dense output as Bernstein control points.
 
-Explicit Runge-Kutta stages are taken from the solver's own tableau, one by one (diffrax loops over them, which costs
-several times as much for small systems and under `jacfwd`), or, in programs for a few calls, in a loop, which compiles
-twice as fast; every other solver takes its own `step`.
+Explicit Runge-Kutta stages are taken from the solver's own tableau, in a loop or, in lanes, one by one (where a loop
+takes several times as long); every other solver takes its own `step`.
 """
 
 import abc
@@ -24,6 +23,7 @@ from ..._numerics._autodiff import frozen
 from ..._numerics._barrier import once
 from ..._numerics._bernstein import binomials, nodes, to_bernstein, to_chebyshev
 from ..._numerics._lane_cond import compact_cond
+from ..._numerics._rolled import rolled
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
@@ -148,6 +148,37 @@ class Stepper(eqx.Module):
         return None
 
 
+def _written_out(tableau: dfx.ButcherTableau, f: Field, span: tuple[Scalar, Scalar], y: Y, k: Y) -> tuple[list[Y], Y]:
+    """The increments of all stages, of which `k` is the first, and the state of the last stage."""
+    (t, t_next), ks, stage = span, [k], y
+    for row, c in zip(tableau.a_lower, tableau.c):
+        stage = _combine(y, list(zip(map(float, row), ks)))
+        slope = f(t_next if c == 1 else t + float(c) * (t_next - t), stage)
+        ks.append(jax.tree.map(lambda k: once((t_next - t) * k), slope))
+    return ks, stage
+
+
+def _looped(tableau: dfx.ButcherTableau, f: Field, span: tuple[Scalar, Scalar], y: Y, k: Y) -> tuple[list[Y], Y]:
+    """The same with the field once in the program: half as much to compile."""
+    (t, t_next), (x, unravel) = span, jfu.ravel_pytree(y)
+    lower = np.zeros((tableau.num_stages, tableau.num_stages))
+    for i, row in enumerate(tableau.a_lower):
+        lower[i + 1, : i + 1] = row
+    rows, shares = jnp.asarray(lower[1:], x.dtype), jnp.asarray(np.asarray(tableau.c), t.dtype)
+
+    def stage(ks: Array, at: tuple[Array, Array, Scalar]) -> tuple[Array, Array]:
+        i, row, c = at
+        state = x + row @ ks
+        slope = f(jnp.where(c == 1, t_next, t + c * (t_next - t)), unravel(state))
+        k = (t_next - t).astype(x.dtype) * jfu.ravel_pytree(slope)[0]
+        return lax.dynamic_update_index_in_dim(ks, k, i, 0), state
+
+    first = jnp.zeros((tableau.num_stages, len(x)), x.dtype).at[0].set(jfu.ravel_pytree(k)[0])
+    index = jnp.arange(1, tableau.num_stages)
+    ks, states = lax.scan(stage, first, (index, rows, shares))
+    return [unravel(k) for k in ks], unravel(states[-1])
+
+
 class RungeKutta(Stepper):
     """Steps of a diffrax Runge-Kutta method.
 
@@ -158,9 +189,9 @@ class RungeKutta(Stepper):
     solver: dfx.AbstractSolver
     degree: int = eqx.field(static=True)
     stages: int = eqx.field(static=True)
-    looped: bool = eqx.field(static=True)  # whether the stages are a loop of the program, or stand in it one by one
+    reverse: bool = eqx.field(static=True)  # whether steps are differentiated backwards
 
-    def __init__(self, solver: dfx.AbstractSolver, looped: bool = False):
+    def __init__(self, solver: dfx.AbstractSolver, reverse: bool = False):
         if isinstance(solver, dfx.AbstractRungeKutta) and isinstance(solver.tableau, dfx.ButcherTableau):
             self.stages = solver.tableau.num_stages
         elif isinstance(solver, (dfx.Euler, dfx.ImplicitEuler)):
@@ -170,7 +201,7 @@ class RungeKutta(Stepper):
                 "Argument `solver` must be a diffrax Runge-Kutta solver for ordinary differential equations (such as "
                 f"Tsit5, Dopri5, Dopri8, Kvaerno5) or Euler, but got {solver!r}."
             )
-        self.solver, self.looped = solver, looped
+        self.solver, self.reverse = solver, reverse
         self.degree = _dense_weights(type(solver), self.stages, _double())[1]
 
     def __call__(
@@ -189,8 +220,12 @@ class RungeKutta(Stepper):
         if isinstance(self.solver, dfx.AbstractERK):
             tableau = self.solver.tableau
             assert isinstance(tableau, dfx.ButcherTableau)
-            stages = self._looped if self.looped else self._unrolled
-            ks, stage = stages(tableau, f, (t, t_next), y, jax.tree.map(lambda k: once(dt * k), f0))
+            first = jax.tree.map(lambda k: once(dt * k), f0)
+            if self.reverse:  # `rolled` has no rule for transposition
+                ks, stage = _written_out(tableau, f, (t, t_next), y, first)
+            else:
+                loop, written_out = ft.partial(_looped, tableau), ft.partial(_written_out, tableau)
+                ks, stage = rolled(loop, written_out, f, (t, y), (t, t_next), y, first)
             y1 = stage if tableau.ssal else _combine(y, list(zip(map(float, tableau.b_sol), ks)))
             error = _combine(jax.tree.map(jnp.zeros_like, y), list(zip(map(float, tableau.b_error), ks)))
             # Free when the first stage of the next step is the last of this one.
@@ -202,37 +237,6 @@ class RungeKutta(Stepper):
         y1, error, dense, *_ = self.solver.step(terms, t, t_next, y, None, memory, made_jump=True)
         ks = [jax.tree.map(lambda k, i=i: k[i], dense["k"]) for i in range(self.stages)]
         return Step(t_next, y1, error, ks)
-
-    @staticmethod
-    def _unrolled(tableau: dfx.ButcherTableau, f: Field, span: tuple[Scalar, Scalar], y: Y, k: Y) -> tuple[list[Y], Y]:
-        """The increments of all stages, of which `k` is the first, and the state of the last stage."""
-        (t, t_next), ks, stage = span, [k], y
-        for row, c in zip(tableau.a_lower, tableau.c):
-            stage = _combine(y, list(zip(map(float, row), ks)))
-            slope = f(t_next if c == 1 else t + float(c) * (t_next - t), stage)
-            ks.append(jax.tree.map(lambda k: once((t_next - t) * k), slope))
-        return ks, stage
-
-    @staticmethod
-    def _looped(tableau: dfx.ButcherTableau, f: Field, span: tuple[Scalar, Scalar], y: Y, k: Y) -> tuple[list[Y], Y]:
-        """The same with the field once in the program: half as much to compile."""
-        (t, t_next), (x, unravel) = span, jfu.ravel_pytree(y)
-        lower = np.zeros((tableau.num_stages, tableau.num_stages))
-        for i, row in enumerate(tableau.a_lower):
-            lower[i + 1, : i + 1] = row
-        rows, shares = jnp.asarray(lower[1:], x.dtype), jnp.asarray(np.asarray(tableau.c), t.dtype)
-
-        def stage(ks: Array, at: tuple[Array, Array, Scalar]) -> tuple[Array, Array]:
-            i, row, c = at
-            state = x + row @ ks
-            slope = f(jnp.where(c == 1, t_next, t + c * (t_next - t)), unravel(state))
-            k = (t_next - t).astype(x.dtype) * jfu.ravel_pytree(slope)[0]
-            return lax.dynamic_update_index_in_dim(ks, k, i, 0), state
-
-        first = jnp.zeros((tableau.num_stages, len(x)), x.dtype).at[0].set(jfu.ravel_pytree(k)[0])
-        index = jnp.arange(1, tableau.num_stages)
-        ks, states = lax.scan(stage, first, (index, rows, shares))
-        return [unravel(k) for k in ks], unravel(states[-1])
 
     def _weighted(self, matrix: np.ndarray, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
         rows = []
