@@ -2,6 +2,7 @@
 
 import abc
 import os
+from collections.abc import Sequence
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import equinox as eqx
@@ -104,3 +105,10 @@ class AbstractBranch(eqx.Module, Generic[SpecialT]):
         words = self._words()
         runs = [word for i, word in enumerate(words) if i == 0 or words[i - 1] != word]
         return ", then ".join(runs) if len(runs) <= 6 else f"{len(runs) - 1} changes of stability"
+
+
+def descends(values: Sequence[Any]) -> bool:
+    """Whether a branch ends lower than it begins. Where both ends are one end of the interval, rounding must not
+    choose its direction."""
+    parameters = np.asarray(values, float)
+    return bool(parameters[0] - parameters[-1] > 1e-9 * np.ptp(parameters))

@@ -11,7 +11,7 @@ from ..._types import Y
 from ...setvalued._crossing import EigenvalueCrossing
 from ...system._system import System
 from .._archive import table
-from .._branch import AbstractBranch
+from .._branch import AbstractBranch, descends
 from ._bifurcation import Bifurcation, HalfBranch, unstable_number
 from ._equations import Record
 
@@ -96,7 +96,7 @@ def branch_of(system: System, parameter: str, back: BranchSegment, ahead: Branch
     segment.special = [(i, b) for i, b in back.special if i < keep]
     last = segment.special[-1][1] if corner and segment.special else None
     segment.special += [(i + max(keep, 0), b) for i, b in ahead.special if b is not last or i > 0]
-    if float(segment.records[0].parameter) > float(segment.records[-1].parameter):
+    if descends([record.parameter for record in segment.records]):
         segment, ends = segment.reversed(), ends[::-1]
     tree = jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *segment.records)
     return Branch(

@@ -20,7 +20,7 @@ from ...setvalued._crossing import EigenvalueCrossing
 from ...system._parameter import parameter_path, put_parameter
 from ...system._system import System
 from .._archive import table
-from .._branch import AbstractBranch
+from .._branch import AbstractBranch, descends
 from ._bifurcation import OrbitBifurcation, OrbitHalfBranch, Origin
 from ._record import states_of
 from ._tracer import midpoint, OrbitPoint
@@ -180,10 +180,7 @@ def orbit_branch(
         tuple((i, b) for i, b in first.special if i < keep)
         + tuple((i + keep, b) for i, b in ahead.special if not (common and i == 0)),
     )
-    start, stop = piece.points[0], piece.points[-1]
-    # Where both ends are the same end of the interval, rounding must not choose.
-    falls = start.spot.parameter - stop.spot.parameter > 1e-9 * float(curve.width)
-    if start.admissible and falls:
+    if piece.points[0].admissible and descends([point.spot.parameter for point in piece.points]):
         piece, ends = piece.reversed(), ends[::-1]
     spots = [point.spot for point in piece.points]
 
