@@ -318,6 +318,7 @@ class Imperfect(nsjax.System):
         return 2 * jnp.pi
 
 
+@pytest.mark.slow
 def test_a_single_branch_point():
     """It lies on a curve over a parameter that leaves the symmetry, and on none over one that breaks it: over both the
     orbits are a smooth surface."""

@@ -122,6 +122,7 @@ def test_orbit_based_on_an_event():
     np.testing.assert_allclose(np.sort(np.abs(orbit.multipliers)), [0, 1], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_forced_orbit_based_on_an_event():
     """The same where time says where the base point is: at the end of a stick phase, an ulp before it, and after it."""
     system = gallery.thesis("6.8")

@@ -91,6 +91,7 @@ def test_noise_ends():
     assert not np.isfinite(found.least[0])
 
 
+@pytest.mark.slow
 def test_orbit_of_twelve_periods():
     """Issue 20.4, pitfall 41: an arc with six peaks of nearly one height. Of 65 samples the largest stands beside
     another one, 2.244732 m; the reference is a fine table of the solution and the polynomial through its largest."""

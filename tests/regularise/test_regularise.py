@@ -156,6 +156,7 @@ def _interfaces(n):
     return tuple(interface(i) for i in range(n))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, b", [pytest.param("banded", 1.4, marks=SLOW), ("linear", 1.0)])
 def test_several_switches(name, b):
     """Three coupled interfaces, forced: they stick alone and in pairs, and a release changes the others' multipliers."""
