@@ -88,7 +88,14 @@ def test_noise_ends():
     found = along([lambda t: 1e-13 * jnp.sin(1e9 * t)], slack=1e-9)
     assert abs(found.least[0]) <= 2e-13
     found = along([lambda t: jnp.full_like(t, jnp.nan)])
-    assert not np.isfinite(found.least[0])
+    assert np.isnan(found.least[0])
+
+
+def test_a_part_that_is_not_known():
+    """What is NaN on a piece of the path is not told from the others."""
+    found = along([lambda t: jnp.where(t < 0.4, jnp.cos(40 * t), jnp.nan)], [lambda t: -jnp.cos(40 * t)])
+    assert np.isnan(found.least[0])
+    np.testing.assert_allclose(found.least[1], -1, rtol=1e-12)
 
 
 @pytest.mark.slow
