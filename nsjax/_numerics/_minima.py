@@ -124,7 +124,7 @@ def minima(
         states = jax.vmap(lambda phi: _interpolated(xs, phi))(phi)
         share = walk.begin + walk.width * _theta(phi)
         old = walk.minima
-        lower = ~rough & (least < old.least)
+        lower = ~rough & ((least < old.least) | jnp.isnan(least))  # what cannot be told is not told wrong
         first = walk.width == 1
         found = Minima(
             least=jnp.where(lower, least, old.least),

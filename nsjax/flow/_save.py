@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._numerics._barrier import once
 from .._types import Scalar, Y
 from ..system._model import SwitchedSystem
 from .steppers._stepper import bernstein
@@ -41,6 +42,13 @@ def times_in_order(ts: Any, t0: Any, t1: Any) -> Any:
     ahead = (ts >= t0) & (ts <= t1) & forwards.all()
     back = (ts <= t0) & (ts >= t1) & backwards.all()
     return ahead.all() | back.all()
+
+
+def times_between(a: Scalar, b: Scalar, shares: Any) -> tuple[Scalar, Scalar, Array]:
+    """The two times, and those at rising shares of the way from one to the other, none of which lies outside by
+    rounding. (A compiled program may compute a time twice, rounded in two ways.)"""
+    a, b = once((a, b))
+    return a, b, jnp.clip(a + (b - a) * jnp.asarray(shares, b.dtype), jnp.minimum(a, b), jnp.maximum(a, b))
 
 
 def _put(buffer: Any, index: Any, value: Any, when: Any) -> Any:

@@ -262,6 +262,7 @@ def test_stack_of_surfaces():
     assert harder >= 5
 
 
+@pytest.mark.slow
 def test_stack_of_more_surfaces():
     """Pitfall 34: of five surfaces not every assignment is tried; where releasing alone gives a wrong mode one is taken
     back."""

@@ -129,6 +129,7 @@ def damped_period(v_dr, c=0.1, slip=1.0, stick=2.0):
     return duration + (start - x) / v_dr
 
 
+@pytest.mark.slow
 def test_other_parameters_than_the_gallerys_are_searched_from_nothing(tmp_path, monkeypatch):
     """Issue 20.17: the gallery's period, 12.635, is that of twice this orbit, more or less."""
     told = ("--set", "v_dr=0.5", "--y0", "x=2.5,v=0")

@@ -104,6 +104,7 @@ def bumper(omega, sign, less, **options):
     return continue_orbit(system, orbit, "x_c", (corner - 0.5, corner + 0.5), **options), known
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("less, max_step", [(0.1, 0.02), (0.1, 0.2), (0.01, 0.02), (0.01, 0.2)])
 def test_fold_beside_a_corner(less, max_step):
     """Pitfall 25: the fold is 6e-5 and 7e-8 away from the corner at which contact begins."""
@@ -204,6 +205,7 @@ def grazes(known, begin, contact, v, touch):
     return [*returns(known, begin, contact, v, 2), *known.flow(begin, mp.matrix([0, v]), touch, True, 0)]
 
 
+@pytest.mark.slow
 def test_grazing_of_a_continuous_field():
     """A bilinear oscillator: whether a branch comes to a grazing from the side with or without the contact, it goes on,
     though the equations with a contact of no duration are singular."""
@@ -219,6 +221,7 @@ def test_grazing_of_a_continuous_field():
     assert branch.others[0].values.max() == pytest.approx(2.6) and branch.others[0].stable[2:].all()
 
 
+@pytest.mark.slow
 def test_isola_of_a_continuous_field():
     """Its orbits of period 3 at these frequencies are a closed curve, passed through two grazings from one side each."""
     orbit = orbit_of(Bilinear(omega=2.0), Motion(-1.2, 0.4), order=3)
@@ -269,6 +272,7 @@ def test_interval_begins_at_a_corner():
         assert (point.kind, point.count) == ("none", ((1,), (1,)))
 
 
+@pytest.mark.slow
 def test_start_that_sticks():
     """The base point lies on the surface, apart from rounding: the orbit is as it is from elsewhere."""
 

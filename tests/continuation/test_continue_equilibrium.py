@@ -302,6 +302,7 @@ class Three(nsjax.System):
         return y.x - self.mu / 2
 
 
+@pytest.mark.slow
 def test_three_surfaces_meet():
     """For μ < 0 only x = 0; for μ > 0 also x = -4μ/3, where f = -2μ - 3x/2, and x = 7μ/4, where f = 7μ/4 - x."""
 

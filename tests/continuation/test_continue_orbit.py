@@ -114,6 +114,7 @@ def test_stability_by_simulation(name, request):
     assert stability_agrees(request.getfixturevalue(name), 8, seed=1) > 5
 
 
+@pytest.mark.slow
 def test_forced_stick_slip(belt):
     """Section 6.9: A, B, C, both smooth folds, the flip, the Neimark-Sacker point, and branches I to VIII."""
     kinds = {
@@ -146,6 +147,7 @@ def test_forced_stick_slip(belt):
             np.testing.assert_allclose([branch.high.x[i], branch.low.x[i]], [top, bottom], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_another_start(belt):
     """From the unstable branch IV, and from the other end, the same comes out."""
     system = gallery.ForcedStickSlip(omega=1.68)

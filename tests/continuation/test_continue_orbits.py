@@ -62,6 +62,7 @@ def duffing():
     return orbits, continue_orbits(orbits, "omega", (0.9, 2.2), points=500)
 
 
+@pytest.mark.slow
 def test_grazing(walls):
     _, branches = walls
     assert list(branches.ends[2]) == ["no orbit"] * 2 and branches.num[2] == 0
@@ -101,6 +102,7 @@ def test_folds_are_passed(duffing):
         assert stable[between[1] + 1 :].all()
 
 
+@pytest.mark.slow
 def test_two_zeros_in_one_step(duffing):
     """Long steps skip none of the folds, and order them along the branch."""
     orbits, branches = duffing

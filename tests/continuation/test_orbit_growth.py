@@ -119,6 +119,7 @@ def test_gone_on_with(belt, tmp_path, share):
     assert list(loaded) == []
 
 
+@pytest.mark.slow
 def test_several_branches(duffing, tmp_path):
     """Saved and loaded again and again: nodes, and what meets there, are still one."""
     what, options, whole, count = duffing
@@ -331,6 +332,7 @@ def is_point(orbit, branch, index):
     assert np.isinf(orbit.multipliers).sum() == np.isinf(want).sum()
 
 
+@pytest.mark.slow
 def test_orbit_at_a_point(belt, duffing):
     """Stable, unstable, and infinitely unstable orbits."""
     part = belt[2].branch

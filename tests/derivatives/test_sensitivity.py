@@ -26,6 +26,7 @@ def touch(system):
     return sensitivity(end, system)
 
 
+@pytest.mark.slow
 def test_a_walk_over_a_grazing_is_seen():
     """Pitfall 21: on one side of it the derivative is that of an impact, on the other there is none."""
     gaps = (-0.1, -0.01, 0.01, 0.1)

@@ -49,6 +49,7 @@ class Near(nsjax.System):
         return y.x - 1.0
 
 
+@pytest.mark.slow
 def test_surface_that_is_all_but_reached():
     """Pitfall 18: a lane that looks for a root on its step and finds none has a gradient all the same."""
 
@@ -72,6 +73,7 @@ def test_lanes(forward, adjoint):
     assert np.isfinite(gradient).all()
 
 
+@pytest.mark.slow
 def test_lanes_that_have_ended():
     """Pitfall 18: a lane that has ended goes on with steps of no length, whose NaN must not reach the gradient."""
 

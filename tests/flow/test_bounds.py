@@ -93,6 +93,7 @@ def _interfaces():
     return tuple(interface(i) for i in range(3))
 
 
+@pytest.mark.slow
 def test_what_sticks_goes_on_sticking():
     """With static points there may be several solutions: where the top plate turns round, the interface below it could
     break instead. Those that stuck are kept, and `unique` is False."""

@@ -190,6 +190,7 @@ def test_derivatives_by_the_times_of_jumps():
         np.testing.assert_allclose(got[:, i], (up - down) / 2e-5, atol=3e-8)
 
 
+@pytest.mark.slow
 def test_orbits():
     """Forced by a square wave: the orbit in closed form, its multipliers those of the free oscillator; by shooting and
     in segments."""
@@ -230,6 +231,7 @@ def buck_at_20():
     return nsjax.find_orbit(Buck(V_in=20.0), Charge(12.0, 0.55), solver=dfx.Tsit5())
 
 
+@pytest.mark.slow
 def test_orbit_of_the_buck_converter(buck_at_20):
     state, multipliers = buck_orbit(20.0)
     np.testing.assert_allclose(flat(buck_at_20.y0), state, rtol=1e-9)
@@ -346,6 +348,7 @@ def test_margin_at_a_tick():
         np.testing.assert_allclose(run(1 + gap).margin, gap / 2e-8, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_exponential_refuses_beyond_an_event_too():
     """Issue 20.2: what it cannot step exactly it refuses, also where an event cuts the step short."""
 
@@ -414,6 +417,7 @@ class Steps(nsjax.System):
         return 0.0
 
 
+@pytest.mark.slow
 def test_table_and_a_wall_that_opens():
     """A list of ticks; a mass pressed against a wall that is gone from one of them on moves off at once; and a wall that
     closes upon it is refused."""

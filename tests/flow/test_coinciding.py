@@ -132,7 +132,7 @@ def lane(sol, x):
     return jax.tree.map(lambda a: a[len(STARTS) + BELOW.index(x)], eqx.filter(sol, eqx.is_array))
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "five")) for n in GROUPS])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("three", "five"))) for n in GROUPS])
 def test_elements_that_move_as_one(name):
     """Same events at the same times, one of them for all elements; same motion; and as unique."""
     many, one = group(name, a=0.4)
@@ -162,6 +162,7 @@ def test_shares():
         np.testing.assert_allclose(sol.y1.spent, (theta * b * np.sign(c))[order], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [nsjax.Taylor(), nsjax.Exponential(), dfx.Kvaerno5()])
 def test_other_methods(solver):
     many, one = group("static")
@@ -235,6 +236,7 @@ def _on_blocks(merged) -> tuple[Any, ...]:
     return (a, c, d) if merged else (a, b, c, d)
 
 
+@pytest.mark.slow
 def test_beside_other_surfaces():
     """Two surfaces that coincide and two that do not, all of which act on one another."""
     F = jnp.asarray([0.6, 0.4])
@@ -256,6 +258,7 @@ def test_beside_other_surfaces():
     assert met > 20
 
 
+@pytest.mark.slow
 def test_effects_of_opposite_sign():
     """An element that pushes along (anti-friction) takes its share of the load against its own direction: together they
     hold until both are spent, |x| = F_1 + F_2, though beyond F_1 - F_2 they might slip: a static point of their own.
@@ -300,6 +303,7 @@ def test_parallel_effects_on_different_surfaces():
     np.testing.assert_allclose(flat(sol.y1), [1.5, 0.5], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_batch():
     """Lanes with and without sticking."""
     sol, want = run(*group("static"), 15.0)

@@ -198,6 +198,7 @@ def block(p, u, z):
     return rest, rest + u / (p.mu * p.g), x + u**2 / (2 * p.mu * p.g)
 
 
+@pytest.mark.slow
 def test_friction_by_the_contact_force():
     """Contact together with friction on another coordinate: bounces, rests, slides, sticks."""
     p, u, z = Block(), 5.0, 0.5
@@ -213,6 +214,7 @@ def test_friction_by_the_contact_force():
     np.testing.assert_allclose(slow.y1.x, np.sqrt(2 * z / p.g), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_lift_off_without_sliding():
     """A block that sticks takes off: where there is no contact force there is no friction to hold it, nor need for it."""
     sol = solve(Block(lift=9.81), 0.0, 1.5, Thrown(0.3, 0.0, 0.0, 0.0), **TIGHT)
@@ -329,6 +331,7 @@ class Bar(nsjax.System):
         return self.e
 
 
+@pytest.mark.slow
 def test_flat_landing():
     """Both ends arrive at one instant, each above or below its support by rounding. The first impact opens the other
     contact, which then has none (e = 0.9), or the bar rocks to rest (e = 0), whatever the height."""

@@ -9,6 +9,7 @@ from models import Motion
 
 import nsjax
 from nsjax import gallery, RESULTS
+from nsjax.flow._save import times_between, times_in_order
 
 
 BELT = gallery.StickSlip(v_dr=0.2, F_slip=1.0, F_stick=2.0)
@@ -29,6 +30,19 @@ def test_arrays_of_times(sol):
     event = sol.events[0].t
     before, after = sol(jnp.stack([event, event])), sol(jnp.stack([event, event]), left=False)
     np.testing.assert_allclose(before.x, after.x, atol=1e-12)
+
+
+def test_times_between_two():
+    """Pitfall 42: times that a program makes for itself lie within, whatever its compiler makes of their rounding."""
+
+    @jax.jit
+    def within(first, last):
+        a, b = jnp.sin(first) * 0.7 + 0.1, jnp.sin(last) * 0.7 + 0.1
+        a, b, ts = times_between(a, b, np.linspace(0, 1, 33))
+        return times_in_order(ts, a, b) & (ts[0] == a)
+
+    pairs = np.random.default_rng(0).uniform(-3, 3, (2000, 2))
+    assert jax.vmap(within)(*pairs.T).all()
 
 
 def test_outside(sol):
@@ -122,6 +136,7 @@ def test_orbit_based_on_an_event():
     np.testing.assert_allclose(np.sort(np.abs(orbit.multipliers)), [0, 1], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_forced_orbit_based_on_an_event():
     """The same where time says where the base point is: at the end of a stick phase, an ulp before it, and after it."""
     system = gallery.thesis("6.8")

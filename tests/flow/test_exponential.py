@@ -161,6 +161,7 @@ def test_derivative():
     np.testing.assert_allclose(got, np.asarray(want, float)[:, 2], rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", [1, -1])
 def test_sliding_on_two_surfaces(direction):
     """Corners: sliding on one, then on both; piecewise polynomial, so that Taylor is exact too."""
@@ -258,6 +259,7 @@ class Pressed(nsjax.System):
         return y[0] - self.v
 
 
+@pytest.mark.slow
 def test_sticking_where_the_forcing_turns():
     """Issue 20.11, pitfall 40: the forces cancel while it sticks, and their rounding is judged by them."""
     rng = np.random.default_rng(0)

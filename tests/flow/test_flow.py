@@ -392,6 +392,7 @@ def puck_exactly(t_c):
             on = 1 if v > 0.5 else 0 if v < -0.5 else on
 
 
+@pytest.mark.slow
 def test_impacts_flip_friction_and_relay(puck):
     """Pitfalls 12, 35: an impact reverses v, hence friction's sign and the relay, at the same instant."""
     sol = puck

@@ -134,6 +134,7 @@ def test_held_by_two_that_would_not_hold_alone(y0, unit):
     np.testing.assert_allclose(sol.y1.x, 0, atol=1e-14 * unit)
 
 
+@pytest.mark.slow
 def test_many_surfaces():
     """Issue 20.7 and 20.10 for six surfaces, of which not every assignment is tried: two that are held as above, and two pairs
     of issue 20.7, of which one may have two solutions; the order of declaration is no matter."""

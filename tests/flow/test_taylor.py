@@ -159,6 +159,7 @@ class Rippled(nsjax.System):
         return jnp.sin(y)
 
 
+@pytest.mark.slow
 def test_derivative_by_the_start_with_curved_guards():
     """Steps that may be shortened for the sake of a guard still end where the solution is to end."""
     out = jax.jvp(lambda t0: solve(Rippled(), t0, 3.0, 0.5, solver=Taylor(8)).y1, (0.0,), (1.0,))
@@ -186,6 +187,7 @@ def test_second_derivative():
     np.testing.assert_allclose(got, want, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_backwards():
     """Through a slip and back."""
     system, y0 = gallery.StickSlip(v_dr=0.5), Motion(2.5, -0.5)

@@ -164,6 +164,7 @@ class Beside(nsjax.System):
         return y.y
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("feed", [0.0, 0.2])
 def test_beside_another_surface(feed):
     """Pitfall 38: repulsion of one of two surfaces that are slid on. With `feed` λ_side = -feed / (2 x): it leaves

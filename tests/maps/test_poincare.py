@@ -209,6 +209,7 @@ def edge(v_dr):
 LIMB = np.exp(-2 * np.pi * 0.05 / np.sqrt(1 - 0.05**2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("v_dr, orbits", [(0.5, 2), (1.05, 2), (1.3, 0)])
 def test_figure_6_16(v_dr, orbits):
     """The map spirals in below the unstable orbit and forgets where it came from above it, so that its slope is 0 at
@@ -320,6 +321,7 @@ class ForcedHammer(Hammer):
         return 2 * jnp.pi / self.omega
 
 
+@pytest.mark.slow
 def test_impact_oscillator():
     """Iterates go on from one to the next as one solution does, from the wall too."""
     system, y0 = ForcedHammer(), Motion(1.0, 0.0)
@@ -373,6 +375,7 @@ def reduced_with_slope(system, x, v):
     return found, slope
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("branch", ["I", "IV", "V"])
 def test_reduced_map_meets_the_diagonal_at_orbits(branch):
     exact = orbit_reference.forced_stick_slip_orbit(branch)
@@ -495,6 +498,7 @@ def test_hysteresis():
     assert up.ys.x.shape == (9, 1, 20)
 
 
+@pytest.mark.slow
 def test_brute_force_with_a_section():
     """The stable orbit's maximum, the equilibrium, from which there is no return, and a value that fails: it harms no
     other, and what follows it begins at the start again."""

@@ -88,9 +88,17 @@ def test_noise_ends():
     found = along([lambda t: 1e-13 * jnp.sin(1e9 * t)], slack=1e-9)
     assert abs(found.least[0]) <= 2e-13
     found = along([lambda t: jnp.full_like(t, jnp.nan)])
-    assert not np.isfinite(found.least[0])
+    assert np.isnan(found.least[0])
 
 
+def test_a_part_that_is_not_known():
+    """What is NaN on a piece of the path is not told from the others."""
+    found = along([lambda t: jnp.where(t < 0.4, jnp.cos(40 * t), jnp.nan)], [lambda t: -jnp.cos(40 * t)])
+    assert np.isnan(found.least[0])
+    np.testing.assert_allclose(found.least[1], -1, rtol=1e-12)
+
+
+@pytest.mark.slow
 def test_orbit_of_twelve_periods():
     """Issue 20.4, pitfall 41: an arc with six peaks of nearly one height. Of 65 samples the largest stands beside
     another one, 2.244732 m; the reference is a fine table of the solution and the polynomial through its largest."""

@@ -44,7 +44,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param(c, marks=[pytest.mark.slow] * (c != "autonomous")) for c in CASES])
 def test_one_program_finds_the_same(case):
     """The search within `jax.jit`, one program of its own, has the same base point, period, multipliers and events; its
     multipliers come from saltation matrices, and not from the derivative of the flow."""
@@ -67,6 +67,7 @@ def test_constants_within_a_program():
     np.testing.assert_allclose(period, 2 * np.pi, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_events_beyond_the_bound():
     """The look for a base point has room for several periods; the orbit has not."""
     system = gallery.thesis("3.4")

@@ -222,6 +222,7 @@ class Resonator(nsjax.System):
         return 2 * jnp.pi / self.omega
 
 
+@pytest.mark.slow
 def test_no_orbit_at_all():
     """Nothing returns: x only grows."""
     with pytest.raises(nsjax.SolveError, match="No periodic orbit was found"):
@@ -267,6 +268,7 @@ def test_forced_orbit_and_its_derivative():
     np.testing.assert_allclose(derivative, jnp.stack(jax.jacfwd(exact, (0, 1, 2))(*p), -1), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_maximum():
     """The amplitude of a resonator, with its first and second derivatives; it lies between the samples."""
 
@@ -297,6 +299,7 @@ def two_tones(t, c=0.3):
     return sum((0.1 * np.exp(1j * w * t) / (1 - w**2 + 1j * c * w)).real for w in (1, 0.97))
 
 
+@pytest.mark.slow
 def test_maximum_of_many_peaks():
     """Issue 20.4 and pitfall 41: no fixed number of samples decides which of a hundred peaks is the largest."""
     orbit = find_orbit(TwoTones(), Motion(0.0, 0.3), max_steps=20000)
@@ -473,6 +476,7 @@ class Feedback(nsjax.System):
         return 2 * jnp.pi / 0.7
 
 
+@pytest.mark.slow
 def test_the_mode_of_a_relay_comes_back():
     """Within the hysteresis there is a state that comes back, but with the relay on where it was off."""
     orbit = find_orbit(Feedback(), Motion(1.0, 0.0), **METHOD)
@@ -546,7 +550,11 @@ class Driven(Held):
     [(Held(), {}), (Held(), dict(period=6.0)), (Driven(), {})],
     ids=["free", "period", "forced"],
 )
-@pytest.mark.parametrize("y0", [Motion(0.1, 0.0), Motion(3.0, 0.1)], ids=["at rest", "comes to rest"])
+@pytest.mark.parametrize(
+    "y0",
+    [Motion(0.1, 0.0), pytest.param(Motion(3.0, 0.1), marks=pytest.mark.slow)],
+    ids=["at rest", "comes to rest"],
+)
 def test_a_continuum_is_named(system, guess, y0):
     """Issue 20.12: every x that friction can hold is an equilibrium, or an orbit."""
     orbit = find_orbit(system, y0, throw=False, **guess, **METHOD)

@@ -108,6 +108,7 @@ def test_samples():
         np.testing.assert_allclose(flow.arrive(a, ts[i], x, value, where), xs[i], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_two_frequencies():
     """What the exponential does not know goes by steps."""
     points = []

@@ -123,6 +123,7 @@ def test_not_admissible():
 ENTRIES = [pytest.param(k, marks=() if k == "6.8" else pytest.mark.slow) for k in ("2.4", "3.5", "6.6", "6.8", "6.9")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ENTRIES)
 def test_both_formulations_agree(key):
     """States, events, multipliers; singular monodromy matrices included (pitfall 23)."""
@@ -168,6 +169,7 @@ def test_rest():
         np.testing.assert_allclose(impact.y_before.v, float(exact.next_velocity), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_lanes():
     """Under `vmap` rows are filled up, and each lane has its own result."""
 
@@ -279,6 +281,7 @@ class Ceiling(nsjax.System):
         return Motion(y.v, -y.x - 0.3 * y.v + forcing - 5 * (1 - s.below))
 
 
+@pytest.mark.slow
 def test_no_sample_decides_whether_an_orbit_is_admissible():
     """Issue 20.4 and pitfall 41: a surface is passed at one of a hundred peaks, between any 65 samples."""
     method = dict(stepsize_controller=pid(1e-12), max_steps=20000, max_events=1)

@@ -98,6 +98,7 @@ class Plain(nsjax.System):
 ORIGIN = gallery.Plane(0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_section_5_7():
     """The generalized Jacobian of the gallery's text, and where its eigenvalues cross (5.36)."""
     sides = []

@@ -19,6 +19,7 @@ from ..._types import Scalar, Y
 from ...flow._integrator import Integrator
 from ...flow._mode_flow import ModeFlow
 from ...flow._results import is_okay
+from ...flow._save import times_between
 from ...flow._solve import integrate
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
@@ -105,7 +106,7 @@ class Flows(eqx.Module):
         """Times and states along every arc."""
 
         def along(a: Scalar, b: Scalar, x: Array, state: ModeState) -> tuple[Array, Array]:
-            ts = jnp.linspace(a, b, samples)
+            a, b, ts = times_between(a, b, np.linspace(0, 1, samples))
             return ts, self.piece(a, b, x, state, dfx.SaveAt(ts=ts))
 
         ts, xs = self.rows(along, begin, end, x)
@@ -124,8 +125,7 @@ class Flows(eqx.Module):
         ratio, _ = jfu.ravel_pytree(jax.tree.map(lambda y, tol: jnp.full_like(y, tol), self.y0, _spread(rtol, self.y0)))
 
         def sample(first: Scalar, last: Scalar, x: Array) -> tuple[Array, Array, tuple]:
-            begin, end = a + (b - a) * first, jnp.where(last < 1, a + (b - a) * last, b)
-            ts = jnp.clip(begin + (end - begin) * jnp.asarray(THETA, x.dtype), jnp.minimum(a, b), jnp.maximum(a, b))
+            begin, end, ts = times_between(a + (b - a) * first, jnp.where(last < 1, a + (b - a) * last, b), THETA)
             return ts, self.piece(begin, end, x, state, dfx.SaveAt(ts=ts)), ()
 
         def groups(ts: Array, xs: Array) -> tuple[list[Array], Array]:

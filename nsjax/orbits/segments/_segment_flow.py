@@ -20,6 +20,7 @@ from ..._types import Scalar, Y
 from ...flow._integrator import Integrator
 from ...flow._mode_flow import ModeFlow, VariedModeFlow
 from ...flow._results import is_okay
+from ...flow._save import times_between
 from ...flow._solve import integrate
 from ...flow.steppers._exponential import affine_parts, expm, generator
 from ...system._mode import ModeState
@@ -64,8 +65,7 @@ class SegmentFlow(eqx.Module):
     def along(self, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> tuple[Array, Array, Array]:
         """Times and states at the nodes `THETA` of the way (between steps they are those of the solver's dense output,
         less exact than the steps); and the integrals of the state and of its square."""
-        theta = jnp.asarray(THETA, x.dtype)
-        ts = jnp.clip(a + (b - a) * theta, jnp.minimum(a, b), jnp.maximum(a, b))
+        a, b, ts = times_between(a, b, THETA)
         if self.exact:
             xs = _samples(self, a, b, x, value, state)
             weights = jnp.asarray(WEIGHTS, x.dtype)[:, None] * (b - a)
