@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 from branches import continue_orbit, orbit_of, same_multipliers, stability_agrees, the
 from models import Motion, Stop
 
@@ -247,3 +248,45 @@ def test_autonomous_corner():
     assert (point.kind, point.count, point.transition) == ("none", ((1,), (1,)), None)
     same_multipliers(point.multipliers, (np.asarray(orbit.multipliers),) * 2)
     assert len(branch.branches) == 1 and list(branch.values[[0, -1]]) == pytest.approx([1.9, 2.3])
+
+
+class Squash(nsjax.System):
+    """A ball between a racket at a sin t and a wall at x = L: one impact with two surfaces."""
+
+    a: float = 0.3
+    L: float = 1.0
+    e: float = 0.8
+    period: float = 2 * np.pi
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, s.hit)
+
+    @nsjax.impact
+    def hit(self, t, y):
+        return y.x - self.a * jnp.sin(t), self.L - y.x
+
+    @hit.restitution
+    def hit(self):
+        return self.e
+
+
+def squash(a, L, e):
+    """Time at the racket, and speed after it, of the orbit with one hit of each surface a period."""
+    share = (1 - e**2) / (2 * np.pi * e)
+    t = scipy.optimize.brentq(lambda t: share * (L - a * np.sin(t)) - a * np.cos(t), 0, np.pi / 2, xtol=1e-15)
+    return t, (L - a * np.sin(t)) * (1 + 1 / e) / (2 * np.pi)
+
+
+def test_the_wall_that_is_hit():
+    """An impact with several surfaces, one of which moves: each acts where it is hit, not where it is left."""
+    a, e = 0.3, 0.8
+    t, u = squash(a, 1.0, e)
+    system = Squash(a, 1.0, e)
+    start = Motion(a * np.sin(t) + u * e * t, -u * e)  # at t = 0, on its way to the racket
+    orbit = orbit_of(system, start)
+    assert list(orbit.events.t[:2] - t) == pytest.approx([0, 2 * np.pi * e / (1 + e)], abs=1e-9)
+    branch = continue_orbit(system, orbit, "L", (0.8, 1.2))
+    want = np.array([squash(a, value, e)[1] for value in branch.values])
+    np.testing.assert_allclose(branch.high.v, want, rtol=1e-9)
+    np.testing.assert_allclose(branch.low.v, -e * want, rtol=1e-9)
+    assert list(branch.values[[0, -1]]) == pytest.approx([0.8, 1.2]) and not branch.special_points

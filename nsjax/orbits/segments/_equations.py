@@ -132,9 +132,14 @@ class OrbitCurve(eqx.Module):
         def jump(t: Scalar, x: Array, mode: Array, part: Array, after: Array, slot: Array, ends: Array) -> tuple:
             out = (self.unravel(x), jnp.zeros_like(t))
             if any(isinstance(switch, impact) for switch in model.switches):
-                switch = jnp.asarray([s.switch for s in model.slots], jnp.int32)[slot]
+                table = jnp.asarray([(s.switch, s.part) for s in model.slots], jnp.int32)
+                switch, wall = table[slot]
+                # Of several walls it is the one that is hit, which need not be the one that the segment has left.
+                hits = np.array([isinstance(s, impact) for s in model.switches])
+                hits = hits & (np.arange(len(hits), dtype=np.int32) == switch)
                 k = jnp.where(ends == EVENT, switch, -1)
-                out = landing(model, k, t, self.unravel(x), self.state(mode, part), tuple(after))
+                state = self.state(mode, jnp.where(hits, wall, part))
+                out = landing(model, k, t, self.unravel(x), state, tuple(after))
             return jfu.ravel_pytree(out[0])[0], out[1]
 
         after, rest = jax.vmap(jump)(end, last, mode, part, following, itinerary.slot, itinerary.ends)

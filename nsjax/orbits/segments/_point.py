@@ -359,7 +359,7 @@ def zeros_at_begin(curve: OrbitCurve, itinerary: OrbitItinerary) -> Array:
             elif not model.static(k):
                 order = jnp.where(slid, 2, 1)
         if model.parts[k] > 1:  # above, each component is a guard of its own; below, they are one
-            free = free & jnp.where(mode[:, k] > 0, component == s.part, s.part == 0)
+            free = free & (jnp.where(mode[:, k] < 0, 0, component) == s.part)
         columns.append(jnp.where(left & free, order, 0))
     return jnp.stack([c.astype(jnp.result_type(float)) for c in columns], axis=1)
 
