@@ -8,27 +8,22 @@ import jax.numpy as jnp
 
 from .._numerics._linalg import Row, row, WRITTEN_OUT
 from .._types import Scalar, Y
+from ._coupling import Coupling
 
 
 class Linearisation(NamedTuple):
     """The field for given switch values, and what changes with those that can hold the solution on a surface."""
 
     field: Y
-    pulls: list[Any]  # `[leaf]`: the derivatives of the field by each value, a row; None where it does not act
+    push: Callable[..., list[Any]]  # what changes of those numbers make of the leaves of the field
     rates: Row  # of `SwitchedSystem.level`, for each surface that can be slid on
-    slope: list[Any]  # of each its derivatives by the values, a row
+    slope: list[Any]  # of each its derivatives by the values of each colour, a row: see `Coupling`
 
     def pulled(self, tree: Y, by: Row) -> Y:
         """`tree` moved by the numbers `by` along the derivatives. For the field, if it is affine in the values, that is
         the field for values which differ by these numbers."""
         leaves, structure = jax.tree.flatten(tree)
-
-        def moved(x: Any, pull: Any) -> Any:
-            if isinstance(pull, list):
-                return sum((d * p for d, p in zip(by, pull) if p is not None), x)
-            return x + jnp.tensordot(by, pull, 1)
-
-        return jax.tree.unflatten(structure, [moved(x, pull) for x, pull in zip(leaves, self.pulls)])
+        return jax.tree.unflatten(structure, [x if d is None else x + d for x, d in zip(leaves, self.push(*by))])
 
 
 def linearise(
@@ -38,6 +33,7 @@ def linearise(
     t: Scalar,
     y: Y,
     acts: tuple[tuple[bool, ...], ...],
+    coupling: Coupling,
 ) -> Linearisation:
     """Of `field(*values)`, the leaves of y', and `levels(t, *leaves)`; each value acts on the leaves that `acts` tells.
 
@@ -47,11 +43,11 @@ def linearise(
     # this result: worked out for each of them anew they made larger programs.
     leaves, tree = jax.tree.flatten(y)
     if len(values) > WRITTEN_OUT:
-        at, pulls = jax.vmap(lambda *d: jax.jvp(field, values, d), out_axes=(None, 0))(
-            *jnp.eye(len(values), dtype=t.dtype)
-        )
+        at, push = jax.linearize(field, *values)
         still = jnp.zeros_like(t)
-        slope = jax.vmap(lambda *pull: jax.jvp(levels, (t, *leaves), (still, *pull))[1])(*pulls)
+        pulls = jax.vmap(push)(*jnp.asarray(coupling.seeds, t.dtype))
+        columns = jax.vmap(lambda *pull: jax.jvp(levels, (t, *leaves), (still, *pull))[1])(*pulls)
+        slope = list(jnp.stack(columns))
     else:
         at, columns, slopes = leaves, [], []
         for j, moves in enumerate(acts):
@@ -68,6 +64,11 @@ def linearise(
                 return levels(t, *[full.get(i, leaf) for i, leaf in enumerate(leaves)])
 
             slopes.append(jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(pull[i] for i in moved))[1])
-        pulls, slope = ([list(column) for column in zip(*table)] for table in (columns, slopes))
+        slope = [list(column) for column in zip(*slopes)]
+
+        def push(*by: Scalar) -> list[Any]:
+            terms = [[d * p for d, p in zip(by, pull) if p is not None] for pull in zip(*columns)]
+            return [sum(row[1:], row[0]) if row else None for row in terms]
+
     rates = jax.jvp(levels, (t, *leaves), (jnp.ones_like(t), *at))[1]
-    return Linearisation(jax.tree.unflatten(tree, at), pulls, row(rates), slope)
+    return Linearisation(jax.tree.unflatten(tree, at), push, row(rates), slope)

@@ -14,12 +14,14 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._autodiff import frozen
 from .._numerics._jaxpr import dependence, is_affine, is_constant, touched
 from .._types import Scalar, Y
 from ._clocked import Clocked
+from ._coupling import Coupling
 from ._mode import BEYOND, ModeState, pick, put, Slot
 from ._parameter import Path, put_parameter
 from ._sliding import linearised, project, resolved
@@ -39,6 +41,8 @@ class SwitchedSystem(Clocked):
     jointly_affine: bool = eqx.field(static=True)  # whether the field is so in the values of all of them
     steady: bool = eqx.field(static=True)  # whether what acts on a surface that can be slid on is constant
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # of `holdable`: whose surfaces may coincide
+    coupling: Coupling = eqx.field(static=True)  # of `holdable`: which values act on which surfaces
+    apart: tuple[bool, ...] = eqx.field(static=True)  # which have nothing to do with the mode of any other
     slots: tuple[Slot, ...] = eqx.field(static=True)
 
     def __init__(self, system: System, direction: Any, t: Scalar, y: Y):
@@ -97,12 +101,35 @@ class SwitchedSystem(Clocked):
                 for i in range(j)
                 if (seen[i] & seen[j]).any()
             )
+        self.coupling, self.apart = self._coupled(t, y)
         slots = []
         for k, number in enumerate(self.parts):
             slots += [Slot(k, part, False) for part in range(number)]
             if k in self.holdable:
                 slots += [Slot(k, sign, True) for sign in ((1,) if k in self.contacts else (1, -1))]
         self.slots = tuple(slots)
+
+    def _coupled(self, t: Scalar, y: Y) -> tuple[Coupling, tuple[bool, ...]]:
+        """Which values act on which surfaces: on dh/dt, of contacts on d²h/dt²."""
+        number, one = len(self.switches), jnp.ones_like(t)
+        zeros = tuple(jnp.zeros((), jnp.result_type(t)) for _ in self.switches)
+
+        def levels(t: Scalar, y: Y) -> list[Scalar]:
+            h = [self.h(k, t, y) for k in range(number)]
+            for k in self.contacts:
+                h[k] = jax.jvp(ft.partial(self.h, k), (t, y), (one, self.field(t, y, zeros)))[1]
+            return [part for row in h for part in row]
+
+        def rates(values: tuple) -> list[Scalar]:
+            return jax.jvp(levels, (t, y), (one, self.field(t, y, values)))[1]
+
+        owner, acts = np.repeat(np.arange(number), self.parts), dependence(rates, zeros)
+        touches = np.array([acts[owner == k].any(axis=0) for k in range(number)], bool).reshape(number, number)
+        # Whether the mode of another one has to do with it: of those whose mode is chosen at an event.
+        free = np.array([k in self.contacts or switch.order == 1 for k, switch in enumerate(self.switches)], bool)
+        others = (touches | touches.T) & free & ~np.eye(number, dtype=bool)
+        apart = tuple((~others.any(axis=1)).tolist())
+        return Coupling.of(touches[np.ix_(self.holdable, self.holdable)], self.pairs), apart
 
     @classmethod
     def forwards(cls, system: System, t: Scalar, y: Y) -> "SwitchedSystem":
@@ -194,7 +221,7 @@ class SwitchedSystem(Clocked):
     def linear(self, t: Scalar, y: Y, state: ModeState, s: tuple) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
         """Rates of the holdable surfaces at `s`, and their derivatives with respect to the holdable values."""
         near = linearised(self._in(state), t, y, state, s)
-        return jnp.asarray(near.rates), jnp.stack([jnp.asarray(rates) for rates in near.slope])
+        return jnp.asarray(near.rates), self.coupling.matrix(near.slope)
 
     def values(self, t: Scalar, y: Y, state: ModeState) -> tuple[Any, ...]:
         """The value of every switch in a mode: signs, and the multipliers λ of those that are held, (2.20)."""

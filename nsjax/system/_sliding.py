@@ -6,9 +6,11 @@ from typing import Any, TYPE_CHECKING
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 
-from .._numerics._linalg import parallel, Row, row, solve_rows
+from .._numerics._linalg import parallel, Row, row, solve_rows, WRITTEN_OUT
 from .._types import Scalar, Y
+from ._coupling import Block, members, taken
 from ._linearisation import Linearisation, linearise
 from ._mode import ModeState, put
 
@@ -27,7 +29,7 @@ def linearised(model: "SwitchedSystem", t: Scalar, y: Y, state: ModeState, s: tu
     def levels(t: Scalar, *leaves: Any) -> list[Scalar]:
         return [model.level(k, t, jax.tree.unflatten(tree, leaves), state) for k in model.holdable]
 
-    near = linearise(field, tuple(s[k] for k in model.holdable), levels, t, y, model.acts)
+    near = linearise(field, tuple(s[k] for k in model.holdable), levels, t, y, model.acts, model.coupling)
     if model.contacts and len(model.holdable) > 1:
         # Friction along a contact that holds already is free, and so is that of a contact without force: a trace of
         # compliance gives it the value 0.
@@ -35,28 +37,50 @@ def linearised(model: "SwitchedSystem", t: Scalar, y: Y, state: ModeState, s: tu
         for i in [i for i, k in enumerate(model.holdable) if k not in model.contacts]:
             total = sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(near.slope[i]))
             trace = jnp.where(total == 0, least, 4 * jnp.finfo(t.dtype).eps * total)
-            own = row([trace if i == j else jnp.zeros_like(trace) for j in range(len(model.holdable))])
-            near.slope[i] = jax.tree.map(jnp.subtract, near.slope[i], own)
+            own = model.coupling.colour[i]
+            if isinstance(near.slope[i], list):
+                near.slope[i][own] = near.slope[i][own] - trace
+            else:
+                near.slope[i] = near.slope[i].at[own].add(-trace)
     return near
 
 
 def multipliers(model: "SwitchedSystem", slope: list[Any], right: Row, held: Any) -> Any:
-    """σ with slope σ = right over the holdable switches that are `held`, and 0 for the others.
+    """σ with slope σ = right over the holdable switches that are `held`, and 0 for the others; each block of those that
+    act on each other's surfaces apart."""
+    return model.coupling.joined([_of_blocks(model, group, slope, right, held) for group in model.coupling.groups])
+
+
+def _of_blocks(model: "SwitchedSystem", group: tuple[Block, ...], slope: list[Any], right: Row, held: Any) -> Any:
+    """Of blocks of one size, member by member.
 
     Where surfaces coincide (friction elements on one velocity) slope is singular: it determines only the sum of what
     they do. They share it in proportion to their bounds, |λ_i| / b_i = |λ_j| / b_j, as elastic elements do that yield
     at the same deflection. No other split holds for longer: all of them reach their bounds together, each in the
     direction in which it resists, and so when the sum of their strengths is spent.
     """
-    m, zero, one = len(slope), jnp.zeros_like(right[0]), jnp.ones_like(right[0])
+    which, colour = members(group), model.coupling.colour
+    m = len(which)
+    if m > WRITTEN_OUT:
+        index = np.array(which)
+        slope = [taken(slope[i], colour[index]) for i in which]
+        right, held = taken(right, index), taken(held, index)
+    elif len(group) > 1:
+        table = jnp.stack(slope)
+        slope = [[table[i, colour[j]] if table.shape[1] > 1 else taken(table[:, 0], i) for j in which] for i in which]
+        right, held = ([taken(numbers, i) for i in which] for numbers in (right, held))
+    else:
+        slope = [[slope[i][colour[j]] for j in which] for i in which]
+        right, held = ([numbers[i] for i in which] for numbers in (right, held))
+    zero, one = jnp.zeros_like(right[0]), jnp.ones_like(right[0])
     # Off the surface a slope may vanish, and must not matter; on it the quotient is infinite, and so is noticed.
     units = [row([one if i == j else zero for j in range(m)]) for i in range(m)]
     rows = [jax.tree.map(lambda x, h, u, i=i: jnp.where(held[i] & h, x, u), slope[i], held, units[i]) for i in range(m)]
     right, matrix = jax.tree.map(lambda r, h: jnp.where(h, r, 0), right, held), list(rows)
-    for i, j in model.pairs:
+    for i, j in [(which.index(i), which.index(j)) for i, j in model.pairs if len(group) == 1 and i in which]:
         same = held[i] & held[j] & parallel(rows[i], rows[j])
         # The row tells in which direction each of them pushes the surface, and either of the two rows will do.
-        bounds = {i: model.bound(model.holdable[j]), j: -model.bound(model.holdable[i])}
+        bounds = {i: model.bound(model.holdable[which[j]]), j: -model.bound(model.holdable[which[i]])}
         weights = row([jnp.asarray(bounds.get(n, zero), zero.dtype) for n in range(m)])
         share = jax.tree.map(lambda x, w: jnp.where(x < 0, -w, w), rows[i], weights)
         matrix[j] = jax.tree.map(lambda a, b, same=same: jnp.where(same, a, b), share, matrix[j])

@@ -38,15 +38,32 @@ def coinciding(model: SwitchedSystem, rates: Float[Array, " m"], matrix: Float[A
     return out
 
 
-def attraction(matrix: Float[Array, "m m"], held: Bool[Array, " m"], pairs: Pairs) -> Float[Array, " m"]:
+def attraction(
+    model: SwitchedSystem, matrix: Float[Array, "m m"], held: Bool[Array, " m"], pairs: Pairs
+) -> Float[Array, " m"]:
     """dh_k'/ds_k for each holdable switch while the others that are `held` stay on their surfaces.
 
     That is the Schur complement of M_ij = dh_i'/ds_j over these others. Where it is negative surface k attracts, where
     it is positive it repels (2.25): its diagonal entry M_kk says so only if nothing else is slid on.
     """
+    groups, m = model.coupling.groups, len(held)
+    if all(len(block) == 1 for group in groups for block in group):
+        return matrix[0] if m == 1 else jnp.diagonal(matrix)
+    if groups == ((tuple(range(m)),),):
+        return _within_block(matrix, held, pairs)
+    parts = []
+    for group in groups:
+        index, block = np.array(group), group[0]
+        of = {(block.index(i), block.index(j)): found for (i, j), found in pairs.items() if i in block}
+        inner = matrix[index[:, :, None], index[:, None, :]]
+        found = jax.vmap(lambda matrix, held, of=of: _within_block(matrix, held, of), out_axes=1)(inner, held[index])
+        parts.append([x[0] for x in found] if len(group) == 1 else found)
+    return jnp.asarray(model.coupling.joined(parts))
+
+
+def _within_block(matrix: Float[Array, "m m"], held: Bool[Array, " m"], pairs: Pairs) -> Float[Array, " m"]:
+    """The same for one block of values that act on each other's surfaces."""
     m = len(held)
-    if m == 1:
-        return matrix[0]
     whole, first = _as_one(matrix, held, pairs)
     inverse, inner = _inverse(whole, first)
     free = jnp.diag(whole) - jnp.sum((whole @ inner) * whole.T, axis=1)
@@ -89,7 +106,7 @@ def escapes(model: SwitchedSystem, t: Scalar, y: Y, state: ModeState) -> Bool[Ar
     rates, matrix = model.linear(t, y, state, s)
     held = jnp.stack([model.held(k, state.mode[k]) for k in which])
     pairs = coinciding(model, rates, matrix)
-    repels = held & (attraction(matrix, held, pairs) > 0)
+    repels = held & (attraction(model, matrix, held, pairs) > 0)
     repels = repels & np.array([k not in model.contacts for k in which])
     if len(which) == 1:
         return repels[0]

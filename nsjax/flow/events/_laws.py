@@ -38,6 +38,10 @@ class Instant(NamedTuple):
     def which(self) -> tuple[int, ...]:
         return tuple(self.at)
 
+    def only(self, which: list[int]) -> "Instant":
+        """The same where no others are at their surfaces."""
+        return self._replace(at={k: self.at[k] for k in which})
+
     @property
     def came(self) -> dict[int, Int[Array, ""]]:
         return {k: self.state.mode[k] for k in self.at}
@@ -77,7 +81,7 @@ class Instant(NamedTuple):
         if model.holdable:
             _, matrix = model.linear(t, y, trial, s)
             held = jnp.stack([model.held(k, mode[k]) for k in model.holdable])
-            effects = attraction(matrix, held, self.pairs)
+            effects = attraction(model, matrix, held, self.pairs)
             slopes = slopes | {
                 k: matrix[i, i] if k in model.contacts else effects[i] for i, k in enumerate(model.holdable)
             }

@@ -2,7 +2,7 @@
 
 import functools as ft
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.lax as lax
@@ -70,23 +70,16 @@ def settle(
         here = _together(here, trial)
         for k in filter(here.dry, which):
             trial[k] = jnp.where(here.at[k], 0, trial[k])
-    several, crowded = len(which) > 1, len(which) > _TRIED
-    held = here.look(trial) if model.contacts or crowded or not several else None
-    noise = here.noise(held.s if held else {})
-    if several:
-        found = _best(here, trial, noise)
-    if held is not None and not several:
-        found = _alone(here, trial, held, noise)
-    if held is not None and crowded:
-        # Both are worked out: with a `cond` between them batches of such models came to a standstill.
-        more = sum(here.at[k].astype(jnp.int32) for k in which) > _TRIED
-        found = jax.tree.map(ft.partial(jnp.where, more), _search(here, trial, held, noise, more), found)
-    trial, seen, others, wrong = found
+    alone = [k for k in which if model.apart[k]]
+    parts = [_alone(here.only(alone), trial)] if alone else []
+    if len(alone) < len(which):
+        parts.append(_jointly(here.only([k for k in which if k not in alone]), trial))
+    trial, seen, others, wrong, noise = _merged(trial, parts)
     _, rates, slopes, _ = seen
     if model.contacts and len(model.holdable) > 1:
         trial = _pinned(here, trial, rates)
     state, unsure = _entered(here, trial, seen, others, noise)
-    forked = jnp.any(others)
+    forked = ft.reduce(jnp.logical_or, others.values())
     # At a two-fold n · f⁺ = n · f⁻ = 0, so that λ is 0/0 and no law says whether to stay or to leave. There is none
     # where what acts on the surfaces is constant: n · f⁺ - n · f⁻ keeps its sign.
     for k in which if not model.steady else ():
@@ -102,14 +95,36 @@ def settle(
     return state, unsure, forked, wrong
 
 
+class _Choice(NamedTuple):
+    """The modes of some of the switches at an instant."""
+
+    trial: dict[int, Any]
+    seen: Outcome  # what they lead to
+    others: dict[int, Bool[Array, ""]]  # whether another solution gives it another mode
+    wrong: Bool[Array, ""]  # whether the choice is open
+    noise: dict[int, Scalar]
+
+
+def _merged(trial: dict[int, Any], parts: list[_Choice]) -> _Choice:
+    """What is chosen for switches that have nothing to do with each other."""
+
+    def union(dicts: Any) -> dict[int, Any]:
+        found = [{k: each[k] for k in part.others if k in each} for part, each in zip(parts, dicts)]
+        return {k: x for each in found for k, x in each.items()}
+
+    seen = Outcome(*map(union, zip(*(part.seen for part in parts))))
+    own, others, noise = (union(each) for each in zip(*((p.trial, p.others, p.noise) for p in parts)))
+    return _Choice(trial | own, seen, others, ft.reduce(jnp.logical_or, [p.wrong for p in parts]), noise)
+
+
 def _entered(
-    here: Instant, trial: dict[int, Any], seen: Outcome, others: Bool[Array, " m"], noise: dict
+    here: Instant, trial: dict[int, Any], seen: Outcome, others: dict[int, Bool[Array, ""]], noise: dict
 ) -> tuple[ModeState, Bool[Array, ""]]:
     """The chosen mode, with the roots that its guards have at this instant; and whether a side must be chosen."""
     model, t, leaves = here.model, here.t, here.leaves
     s, rates, slopes, _ = seen
     roots, unsure = list(here.state.roots), jnp.zeros((), bool)
-    for i, k in enumerate(here.which):
+    for k in here.which:
         if k in model.contacts:
             # It lifts off with h = dh/dt = 0, and where its force has reached zero d²h/dt² = 0 too.
             fresh = jnp.where(leaves[k] != 0, 3, 2)
@@ -123,7 +138,7 @@ def _entered(
                 # What begins to be held with λ at its bound need not leave: where λ goes decides.
                 edge = model.edge(k, s[k], nearly(t))
             if here.starts:
-                unsure = unsure | (here.open(k) & (trial[k] == 0) & (slopes[k] > 0) & others[i])
+                unsure = unsure | (here.open(k) & (trial[k] == 0) & (slopes[k] > 0) & others[k])
         held = model.held(k, trial[k]) if k in model.holdable else False
         roots[k] = jnp.where(here.open(k), jnp.where(held, edge, fresh), roots[k]).astype(jnp.int32)
     mode = tuple(m.astype(jnp.int32) for m in trial.values())
@@ -200,6 +215,20 @@ def _assignments(here: Instant) -> tuple[Int[Array, "rows m"], Bool[Array, " row
     return jnp.where(code == 0, first, jnp.where(code == 1, second, third)), real
 
 
+def _jointly(here: Instant, trial: dict) -> _Choice:
+    """The modes of switches that act on each other's surfaces."""
+    which, crowded = here.which, len(here.which) > _TRIED
+    held = here.look(trial) if here.model.contacts or crowded else None
+    noise = here.noise(held.s if held else {})
+    found = _best(here, trial, noise)
+    if held is not None and crowded:
+        # Both are worked out: with a `cond` between them batches of such models came to a standstill.
+        more = sum(here.at[k].astype(jnp.int32) for k in which) > _TRIED
+        found = jax.tree.map(ft.partial(jnp.where, more), _search(here, trial, held, noise, more), found)
+    trial, seen, others, wrong = found
+    return _Choice(trial, seen, dict(zip(which, others)), wrong, noise)
+
+
 def _best(here: Instant, trial: dict, noise: dict) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
     """The assignment to be preferred, of all that are valid; what it leads to; of each switch whether another solution
     gives it another mode; and whether the choice is open."""
@@ -234,18 +263,19 @@ def _guess(here: Instant, trial: dict, seen: Outcome) -> dict:
     return out
 
 
-def _alone(
-    here: Instant, trial: dict, seen: Outcome, noise: dict
-) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
-    """The same as `_best` for one switch, which has no choice."""
-    ((k, at),) = here.at.items()
+def _alone(here: Instant, trial: dict) -> _Choice:
+    """The modes of switches on whose surfaces no other value acts: none of them has a choice."""
+    model, seen = here.model, here.look(trial)
+    noise = here.noise(seen.s)
     first = _guess(here, trial, seen)
-    trial = _amend(here, first, here.look(first), noise)[0]
-    forked = jnp.zeros((), bool)
-    if here.dry(k):
-        held = _either(seen.s[k], here.model.bound(k), seen.slopes[k])
-        forked = at & here.fresh(k) & (here.leaves[k] == 0) & held
-    return trial, here.look(trial), forked[None], jnp.zeros((), bool)
+    if len(here.which) > 1:
+        here, first = _left_together(here, first, seen)
+    trial = _amend(here, first, here.look(first), noise, apart=True)[0]
+    others = {k: jnp.zeros((), bool) for k in here.which}
+    for k in filter(here.dry, here.which):
+        either = _either(seen.s[k], model.bound(k), seen.slopes[k])
+        others[k] = here.at[k] & here.fresh(k) & (here.leaves[k] == 0) & either
+    return _Choice(trial, here.look(trial), others, jnp.zeros((), bool), noise)
 
 
 def _either(multiplier: Scalar, bound: Any, slope: Scalar) -> Bool[Array, ""]:
@@ -255,22 +285,25 @@ def _either(multiplier: Scalar, bound: Any, slope: Scalar) -> Bool[Array, ""]:
     return (size <= bound) & ((slope > 0) | (size > 1 + nearly(size)))
 
 
+def _left_together(here: Instant, trial: dict, seen: Outcome) -> tuple[Instant, dict]:
+    """A bound that is reached together with that of another switch is left with it, and what has just left stays so."""
+    leaves, trial = dict(here.leaves), dict(trial)
+    for k, came in here.came.items():
+        if here.dry(k):
+            over = seen.s[k] * came.astype(here.t.dtype) / here.model.bound(k) - 1
+            tied = here.open(k) & (came != 0) & (seen.slopes[k] < 0) & (leaves[k] == 0)
+            tied = tied & (jnp.abs(over) <= nearly(over))
+            leaves[k] = jnp.where(tied, came, leaves[k])
+            trial[k] = jnp.where(tied, came, trial[k])
+    return here._replace(leaves=leaves), trial
+
+
 def _search(
     here: Instant, trial: dict, seen: Outcome, noise: dict, wanted: Bool[Array, ""]
 ) -> tuple[dict, Outcome, Bool[Array, " m"], Bool[Array, ""]]:
     """The same where there are too many to try every assignment, if that is `wanted`."""
-    which, came = here.which, here.came
-    trial = _guess(here, trial, seen)
-    # A bound that is reached together with that of another switch is left with it, not in a second event.
-    leaves = dict(here.leaves)
-    for k in which:
-        if here.dry(k):
-            over = seen.s[k] * came[k].astype(here.t.dtype) / here.model.bound(k) - 1
-            tied = here.open(k) & (came[k] != 0) & (seen.slopes[k] < 0) & (leaves[k] == 0)
-            tied = tied & (jnp.abs(over) <= nearly(over))
-            leaves[k] = jnp.where(tied, came[k], leaves[k])
-            trial[k] = jnp.where(tied, came[k], trial[k])
-    here = here._replace(leaves=leaves)
+    which = here.which
+    here, trial = _left_together(here, _guess(here, trial, seen), seen)
 
     # One release or taking back a round, until nothing is violated: of two that violate their laws, one may hold once
     # the other is released. In all rounds together each can change twice.
@@ -324,30 +357,34 @@ def _pinned(here: Instant, trial: dict, rates: dict) -> dict:
     return out
 
 
-def _amend(here: Instant, trial: dict, seen: Outcome, noise: dict) -> tuple[dict, Bool[Array, ""]]:
-    """One release, or one taking back, of the switch that violates its law most."""
+def _amend(here: Instant, trial: dict, seen: Outcome, noise: dict, apart: bool = False) -> tuple[dict, Bool[Array, ""]]:
+    """One release, or one taking back, of the switch that violates its law most; of each, if they are `apart`."""
     model, which = here.model, here.which
     s, rates, slopes, _ = seen
     excess, opposed = [], []
+    # What reaches its bound together with another one is let go by an event of its own, whatever rounding says.
+    slack = nearly(here.t) if apart and len(which) > 1 else 0.0
     for k in which:
         held = here.open(k) & model.held(k, trial[k]) if k in model.holdable else jnp.zeros((), bool)
         if k in model.contacts:
             over, against = -s[k] * slopes[k] - noise[k], -rates[k]
         else:
-            over = jnp.abs(s[k]) / (model.bound(k) if k in model.holdable else 1) - 1
+            over = jnp.abs(s[k]) / (model.bound(k) if k in model.holdable else 1) - (1 + slack)
             against = -rates[k] * trial[k].astype(rates[k].dtype)
         excess.append(jnp.where(held, over, -1))
         # What has just left has its λ at the bound (or it crosses): dh/dt may be zero apart from rounding.
         free = here.open(k) & ~held & (trial[k] != 0 if k not in model.contacts else True) & (here.leaves[k] == 0)
         opposed.append(jnp.where(free & (against > 1e-10 * jnp.abs(slopes[k])), against, 0))
-    worst = jnp.stack(excess)
-    back = jnp.stack(opposed)
-    release = jnp.any(~(worst <= 0))  # a multiplier that is not a number is a violation too
-    retake = ~release & jnp.any(back > 0)
+    # (A multiplier that is NaN is a violation too.)
+    released = [~(over <= 0) for over in excess]
+    retaken = [(against > 0) & ~over for against, over in zip(opposed, released)]
+    if not apart:
+        worst, back = jnp.stack(excess), jnp.stack(opposed)
+        release, index = jnp.any(~(worst <= 0)), np.arange(len(which))
+        released = list(release & (jnp.argmax(jnp.where(jnp.isnan(worst), jnp.inf, worst)) == index))
+        retaken = list(~release & jnp.any(back > 0) & (jnp.argmax(back) == index))
     out = dict(trial)
-    for i, k in enumerate(which):
-        first = release & (jnp.argmax(jnp.where(jnp.isnan(worst), jnp.inf, worst)) == i)
-        again = retake & (jnp.argmax(back) == i)
+    for k, first, again in zip(which, released, retaken):
         if k in model.contacts:
             side, taken = 0, 1
         else:
@@ -360,4 +397,4 @@ def _amend(here: Instant, trial: dict, seen: Outcome, noise: dict) -> tuple[dict
         for k, other in ((model.holdable[i], model.holdable[j]), (model.holdable[j], model.holdable[i])):
             follows = same & (out[k] != trial[k]) & here.open(other)
             moved[other] = jnp.where(follows, ratio.astype(jnp.int32) * out[k], moved[other]).astype(jnp.int32)
-    return moved, release | retake
+    return moved, ft.reduce(jnp.logical_or, [*released, *retaken])

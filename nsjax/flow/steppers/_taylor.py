@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._numerics._bernstein import binomials
-from ..._numerics._linalg import row
+from ..._numerics._linalg import row, WRITTEN_OUT
 from ..._numerics._series import Coefficient, Series
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
@@ -176,15 +176,20 @@ class TaylorStepper(Stepper):
         leaves, tree = jax.tree.flatten(y)
         which = model.holdable
         s = model.values(t, y, state)
-        inverse = None
+        inverse: Any = []
+        blocks = model.coupling.block_of
         if which:
             held = row([model.held(k, state.mode[k]) for k in which])
             # In every order the unknown coefficient of λ is multiplied by the matrix at the start alone: one inverse
-            # serves for all orders, where solving anew would take as many linear systems as there are terms.
-            slope, units = linearised(model, t, y, state, s).slope, row(jnp.eye(len(which), dtype=t.dtype))
-            solved = jax.vmap(ft.partial(multipliers, model), in_axes=(None, 0, None))(slope, units, held)
-            inverse = jnp.stack(list(solved))
-            inverse = inverse if isinstance(units, list) else inverse.T
+            # serves for all orders, where solving anew would take as many linear systems as there are terms. Of each
+            # block the columns of its first member, of its second, and so on.
+            slope, size = linearised(model, t, y, state, s).slope, max(map(len, blocks))
+            units = np.array([[block[n : n + 1] == (i,) for i, block in enumerate(blocks)] for n in range(size)])
+            solve = ft.partial(multipliers, model, slope)
+            if size > WRITTEN_OUT:
+                inverse = jax.vmap(solve, in_axes=(0, None))(jnp.asarray(units, t.dtype), held)
+            else:
+                inverse = [solve(row(list(jnp.asarray(unit, t.dtype))), held) for unit in units]
 
         def fn(t: Scalar, *args: Array) -> list[Array]:
             y, s = jax.tree.unflatten(tree, args[: len(leaves)]), self.values(model, state, t, args[len(leaves) :])
@@ -192,9 +197,11 @@ class TaylorStepper(Stepper):
             return [*jax.tree.leaves(model.field(t, y, s)), *rates]
 
         def correct(rates: list[Coefficient]) -> list[Coefficient]:
-            assert inverse is not None
-            rows = [[inverse[i, j] * r for j, r in enumerate(rates) if r is not None] for i in range(len(which))]
-            return [-sum(row[1:], row[0]) if row else None for row in rows]
+            rows = [
+                [inverse[n][i] * r for n, j in enumerate(block) if (r := rates[j]) is not None]
+                for i, block in enumerate(blocks)
+            ]
+            return [-ft.reduce(lambda a, b: a + b, row) if row else None for row in rows]
 
         ys, sigma = _expand(fn, t, leaves, [s[k] for k in which], correct, self.degree)
         columns = []
