@@ -64,8 +64,21 @@ class Coupling(NamedTuple):
 
     @property
     def block_of(self) -> list[Block]:
+        """That to which each value belongs."""
         found = {i: block for group in self.groups for block in group for i in block}
         return [found[i] for i in range(len(found))]
+
+    def entries(self, slope: list[Any], i: Any, j: Any) -> Array:
+        """Of the matrix, of surfaces i and values j: numbers, or arrays of them."""
+        if isinstance(slope[0], list):
+            return slope[i][j]
+        there, colour = np.array(self.touches)[i, j], self.colour[j]
+        if np.ndim(i):
+            found = jnp.stack(slope)[i, colour] if len(self.colours) > 1 else taken(jnp.stack(slope)[:, 0], i)
+        else:
+            found = taken(slope[i], colour)
+        # Of a colour only one value acts on a surface, and the others of a block need not.
+        return found if np.all(there) else jnp.where(there, found, 0)
 
     def matrix(self, slope: list[Any]) -> Float[Array, "m m"]:
         """With all of its zeros."""
@@ -88,5 +101,6 @@ def members(group: tuple[Block, ...]) -> list[Any]:
     return list(group[0]) if len(group) == 1 else [np.array(column) for column in zip(*group)]
 
 
-def taken(x: Array, index: np.ndarray) -> Array:
-    return x if np.array_equal(index, np.arange(len(x))) else x[index]
+def taken(x: Any, index: Any) -> Any:
+    """Members of a row: one, or several."""
+    return x if np.ndim(index) and np.array_equal(index, np.arange(len(x))) else x[index]

@@ -59,19 +59,15 @@ def _of_blocks(model: "SwitchedSystem", group: tuple[Block, ...], slope: list[An
     at the same deflection. No other split holds for longer: all of them reach their bounds together, each in the
     direction in which it resists, and so when the sum of their strengths is spent.
     """
-    which, colour = members(group), model.coupling.colour
+    which, coupling = members(group), model.coupling
     m = len(which)
     if m > WRITTEN_OUT:
         index = np.array(which)
-        slope = [taken(slope[i], colour[index]) for i in which]
+        slope = [coupling.entries(slope, i, index) for i in which]
         right, held = taken(right, index), taken(held, index)
-    elif len(group) > 1:
-        table = jnp.stack(slope)
-        slope = [[table[i, colour[j]] if table.shape[1] > 1 else taken(table[:, 0], i) for j in which] for i in which]
-        right, held = ([taken(numbers, i) for i in which] for numbers in (right, held))
     else:
-        slope = [[slope[i][colour[j]] for j in which] for i in which]
-        right, held = ([numbers[i] for i in which] for numbers in (right, held))
+        slope = [[coupling.entries(slope, i, j) for j in which] for i in which]
+        right, held = ([taken(numbers, i) for i in which] for numbers in (right, held))
     zero, one = jnp.zeros_like(right[0]), jnp.ones_like(right[0])
     # Off the surface a slope may vanish, and must not matter; on it the quotient is infinite, and so is noticed.
     units = [row([one if i == j else zero for j in range(m)]) for i in range(m)]

@@ -63,6 +63,11 @@ SHAPES = {
     "one large": blocks(5, 1, 1, order=[5, 0, 1, 6, 2, 3, 4]),
     "three": blocks(2, 1, order=[0, 2, 1]),
     "one way": np.tril(np.ones((4, 4), bool)),
+    "one after the other": np.eye(5, dtype=bool) | np.eye(5, k=-1, dtype=bool),
+    "bands": np.tri(7, k=1, dtype=bool) & np.tri(7, k=1, dtype=bool).T,
+    "short chains": np.kron(np.eye(2), np.eye(3) + np.eye(3, k=1)).astype(bool)[:, [1, 0, 2, 4, 3, 5]][
+        [1, 0, 2, 4, 3, 5]
+    ],
 }
 
 
