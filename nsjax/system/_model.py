@@ -2,7 +2,7 @@
 
 A mode is one small integer for each switch: for `sgn` the sign +1 or -1 of its region, or 0 while sliding; for
 `relay` 0 or 1; for `impact` 0 in free flight, 1 in resting contact; for `clock` the number of its ticks. There is no
-table of 3^m fields (only of up to four switches are all combinations tried where they meet, `events/_mode_choice`):
+table of 3^m fields (only of up to four that act on each other are all modes tried, `events/_mode_choice`):
 being held on m surfaces at once solves m equations for the m multipliers, n_i . f(t, y, λ) + ∂h_i/∂t = 0 for sliding,
 (2.19)-(2.20), and d²h_i/dt² = 0 for contact, whose multiplier is the contact force.
 """

@@ -36,11 +36,11 @@ def settle(
     """Gives every `sgn` switch that is at its surface a mode from {0, +1, -1}, every contact one from {1, 0}.
 
     An assignment is valid if each that holds has |λ| <= b (a contact a force λ >= 0) and each other one moves to its
-    side. Where up to four switches are at their surfaces every assignment is tried; of the valid ones those are
-    preferred in which no surface that repels holds what arrives at it, of these the ones that hold most, that keep what
-    held before, and that cross what is met. Where more are, all are held that attract, the one that violates its law
-    most is released, to the sign of its λ, and a released switch whose motion then opposes this is taken back, until
-    nothing is violated.
+    side. A switch that acts on no other's surface, and on whose surface no other acts, has no choice. Of up to four
+    others that are at their surfaces every assignment is tried; of the valid ones those are preferred in which no
+    surface that repels holds what arrives at it, of these the ones that hold most, that keep what held before, and that
+    cross what is met. Where more are, all are held that attract, the one that violates its law most is released, to the
+    sign of its λ, and a released switch whose motion opposes this is taken back, until nothing is violated.
 
     **Arguments:**
 
