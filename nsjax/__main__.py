@@ -147,7 +147,7 @@ def _find(
     _note(f"looking for a periodic orbit of {guess.words or 'unknown period'}")
     orbit, trouble = _try(args, job, t0, guess)
     departs = not job.from_gallery or any((args.set, args.y0, args.period, args.mode, args.t0))
-    if orbit is not None or not departs or not guess.words or args.order is not None:
+    if trouble is None or not departs or not guess.words or args.order is not None:
         return orbit, trouble
     _note("looking for it where the solution settles")
     order = 1 if job.system.period is None else None
@@ -160,7 +160,7 @@ def _find(
     return orbit, None
 
 
-def _try(args: argparse.Namespace, job: Job, t0: float, guess: _Guess) -> tuple[Orbit | None, str]:
+def _try(args: argparse.Namespace, job: Job, t0: float, guess: _Guess) -> tuple[Orbit | None, str | None]:
     try:
         orbit = find_orbit(
             job.system, guess.y0, period=guess.period, t0=t0, order=guess.order, mode=guess.mode, throw=False,
@@ -170,7 +170,7 @@ def _try(args: argparse.Namespace, job: Job, t0: float, guess: _Guess) -> tuple[
         if mistake(error, model_file(args.system)) is not None:
             raise
         return None, first_line(error)
-    return (orbit, "") if orbit.result == RESULTS.successful else (None, advice(orbit.result))
+    return (orbit, None) if orbit.result == RESULTS.successful else (None, advice(orbit.result))
 
 
 def _write_json(file: str | None, numbers: dict[str, Any]) -> None:

@@ -59,6 +59,7 @@ def test_run_prints_everything(run_34):
     ):
         assert re.search(words, out), words
     assert out.count("saltation matrix at") == 2 and "t [s]" in out
+    assert "no periodic orbit" not in out  # there is one
 
 
 def test_run_draws_the_pictures(run_34):
