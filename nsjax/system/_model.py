@@ -35,6 +35,7 @@ class SwitchedSystem(Clocked):
     parts: tuple[int, ...] = eqx.field(static=True)  # number of components of h, per switch
     holdable: tuple[int, ...] = eqx.field(static=True)  # switches whose value can hold the solution on their surface
     contacts: tuple[int, ...] = eqx.field(static=True)  # the impacts among them
+    holding: tuple[int, ...] = eqx.field(static=True)  # of `holdable`: in which mode
     acts: tuple[tuple[bool, ...], ...] = eqx.field(
         static=True
     )  # the value of each of them on which leaves of the state
@@ -69,6 +70,7 @@ class SwitchedSystem(Clocked):
 
         self.holdable = tuple(k for k in range(len(self.switches)) if holds(k))
         self.contacts = tuple(k for k in self.holdable if self.switches[k].order == 2)
+        self.holding = tuple(self.switches[k].holding for k in self.holdable)
 
         def pulled(values: tuple) -> list[Any]:
             return jax.tree.leaves(self.field(t, y, put(zeros, self.holdable, values)))
@@ -183,9 +185,10 @@ class SwitchedSystem(Clocked):
         """Whether `mode` of switch k holds the solution on its surface."""
         return mode == self.switches[k].holding
 
-    def holds(self, mode: Any) -> bool:
-        """Whether one of its switches does; of a mode that is known."""
-        return any(bool(self.held(k, mode[k])) for k in self.holdable)
+    def holds(self, *modes: Any) -> bool:
+        """Whether one of its switches does; in any of some modes that are known."""
+        switches, holding = list(self.holdable), np.array(self.holding, int)
+        return bool(np.any(np.stack(modes)[:, switches] == holding))
 
     def level(self, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
         """What its multiplier keeps at zero: the active component of h; for a contact dh/dt, on which forces act."""

@@ -54,7 +54,8 @@ class OrbitCurve(eqx.Module):
 
     def on(self, itinerary: OrbitItinerary) -> "OrbitCurve":
         """With flows as the modes of an itinerary allow."""
-        return dataclasses.replace(self, slides=any(self.model.holds(itinerary.mode[i]) for i in itinerary.rows))
+        slides = self.model.holds(*np.asarray(itinerary.mode)[: int(itinerary.num)])
+        return self if slides == self.slides else dataclasses.replace(self, slides=slides)
 
     @property
     def flow(self) -> SegmentFlow:
