@@ -7,6 +7,7 @@ from . import (
     flow as flow,
     gallery as gallery,
     maps as maps,
+    mechanics as mechanics,
     orbits as orbits,
     plot as plot,
     regularise as regularise,

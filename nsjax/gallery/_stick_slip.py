@@ -3,9 +3,9 @@
 from jaxtyping import Array, Float
 
 from .._types import Number, Scalar
+from ..mechanics._friction_law import falling
 from ..system._sgn import sgn
 from ..system._system import SwitchValues, System
-from ._friction import falling
 from ._motion import Motion
 
 

@@ -15,7 +15,7 @@ from .._types import Scalar, Y
 from ._clock import clock
 from ._mode import ModeState
 from ._model import SwitchedSystem
-from ._system import System
+from ._system import is_number, System
 
 
 def check_system(system: Any) -> None:
@@ -24,14 +24,16 @@ def check_system(system: Any) -> None:
         raise TypeError(f"Argument `system` must be an instance of `nsjax.System`, but got {system!r}.{hint}")
 
 
-def check_fields(system: System) -> None:
-    """Checks that parameters declared as numbers are numbers."""
-    for field in dataclasses.fields(system):
-        value = getattr(system, field.name)
-        if isinstance(value, System):
-            check_fields(value)
-        if field.type in (float, "float") and (value is None or isinstance(value, str)):
-            owner = type(system).__name__
+def check_fields(module: eqx.Module) -> None:
+    """Checks that parameters declared as numbers are numbers, in modules within modules too."""
+    for field in dataclasses.fields(module):
+        value = getattr(module, field.name)
+        for part in value if type(value) is tuple else (value,):
+            if isinstance(part, eqx.Module):
+                check_fields(part)
+        missing = value is None and field.type in (float, "float")
+        if is_number(field) and (missing or isinstance(value, str)):
+            owner = type(module).__name__
             raise TypeError(f"Parameter `{field.name}` of `{owner}` must be a number, but is {value!r}.")
 
 
@@ -44,15 +46,14 @@ def check_parameters(system: System) -> None:
         if eqx.is_inexact_array_like(x) and np.isnan(np.asarray(x)).any():
             name = jax.tree_util.keystr(path, simple=True, separator=".")
             raise ValueError(f"Parameter `{name}` of `{owner}` must be a number, but is NaN.")
-    for switch in system.switches:
-        with jax.ensure_compile_time_eval():  # also within a function that is being compiled
-            found = switch.laws(system)
-        for part, law, good, value in found:
-            if not np.all(np.asarray(good)):
-                got = np.asarray(value)
-                raise ValueError(
-                    f"`{owner}.{switch.name}{part}` must be {law}, but is {got if got.ndim else float(got)}."
-                )
+    with jax.ensure_compile_time_eval():  # also within a function that is being compiled
+        found = system.laws
+        for switch in system.switches:
+            found = found + [(f"{switch.name}{part}", *rest) for part, *rest in switch.laws(system)]
+    for name, law, good, value in found:
+        if not np.all(np.asarray(good)):
+            got = np.asarray(value)
+            raise ValueError(f"`{owner}.{name}` must be {law}, but is {got if got.ndim else float(got)}.")
 
 
 def check_model(system: System, t: Scalar, y: Y, direction: Scalar) -> Scalar:

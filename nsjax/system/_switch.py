@@ -142,10 +142,27 @@ class AbstractSwitch(abc.ABC):
 
 
 @ft.cache  # switches are told apart by identity
-def forwarded(switch: AbstractSwitch) -> Any:
-    """The switch for a system that has the switch's own system as its field `system`."""
+def within(switch: AbstractSwitch, path: tuple[str, ...], name: str) -> Any:
+    """The switch for a system in which the owner of the switch is found by the attributes of `path`."""
 
     def forward(fn: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda self, *args: fn(self.system, *args)
+        return lambda self, *args: fn(ft.reduce(getattr, path, self), *args)
 
-    return switch._with(**{name: forward(part) for name, part in vars(switch).items() if callable(part)})
+    return switch._with(name=name, **{part: forward(fn) for part, fn in vars(switch).items() if callable(fn)})
+
+
+def forwarded(switch: AbstractSwitch) -> Any:
+    """The switch for a system that has the switch's own system as its field `system`."""
+    return within(switch, ("system",), switch.name)
+
+
+def declared(cls: type) -> tuple[AbstractSwitch, ...]:
+    """The decorated methods of a class in order of definition, base classes first."""
+    found: dict[str, Any] = {}
+    for base in reversed(cls.__mro__):
+        for name, value in vars(base).items():
+            if isinstance(value, AbstractSwitch):
+                found[name] = value
+            elif name in found:
+                del found[name]
+    return tuple(found.values())

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from .._numerics._text import did_you_mean
 from .._types import Scalar, Y
-from ._switch import AbstractSwitch
+from ._switch import AbstractSwitch, declared
 
 
 class SwitchValues:
@@ -85,14 +85,7 @@ class System(eqx.Module):
     def switches(self) -> tuple[AbstractSwitch, ...]:
         """The switches, by default the decorated methods in order of definition, base classes first. Override it for
         a system that is assembled at run time."""
-        found: dict[str, Any] = {}
-        for cls in reversed(type(self).__mro__):
-            for name, value in vars(cls).items():
-                if isinstance(value, AbstractSwitch):
-                    found[name] = value
-                elif name in found:
-                    del found[name]
-        return tuple(found.values())
+        return declared(type(self))
 
     @property
     def period(self) -> Float[Array, ""] | float | None:
@@ -100,9 +93,44 @@ class System(eqx.Module):
         the default, is for an autonomous model."""
         return None
 
+    @property
+    def members(self) -> dict[str, Any]:
+        """What parameters are found in, by name: the fields. A system that is assembled at run time names its parts."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    @property
+    def laws(self) -> list[tuple[str, str, Any, Any]]:
+        """What must hold for the parameters, beside what the switches ask for, checked where they are known: the name
+        of a parameter, the law, whether it holds, and the value."""
+        return []
+
     def values(self, s: tuple[Any, ...]) -> SwitchValues:
         """The argument `s` of `vector_field` from a tuple of values in the order of `switches`."""
         return SwitchValues(type(self).__name__, dict(zip([k.name for k in self.switches], s)))
+
+
+def is_number(field: dataclasses.Field) -> bool:
+    """Whether a field is declared to be a number, which may be left out."""
+    return field.type in (float, "float", float | None, "float | None")
+
+
+def _with_floats(x: Any) -> Any:
+    """The integers given for fields that are numbers as floats, in modules within modules too."""
+    if type(x) is tuple:
+        parts = tuple(map(_with_floats, x))
+        return x if all(new is old for new, old in zip(parts, x)) else parts
+    if not isinstance(x, eqx.Module):
+        return x
+    changed: dict[str, Any] = {}
+    for field in dataclasses.fields(x):
+        value = getattr(x, field.name)
+        whole = is_number(field) and isinstance(value, int) and not isinstance(value, bool)
+        new = float(value) if whole else _with_floats(value)
+        if new is not value:
+            changed[field.name] = new
+    for name, new in changed.items():
+        x = eqx.tree_at(lambda m, name=name: getattr(m, name), x, new, is_leaf=lambda leaf: leaf is None)
+    return x
 
 
 def arrays_of(system: System, dtype: Any) -> System:
@@ -112,21 +140,10 @@ def arrays_of(system: System, dtype: Any) -> System:
     may decide shapes.
     """
 
-    def is_float_field(field: dataclasses.Field) -> bool:
-        return field.type in (float, "float")
-
     def convert(x: Any) -> Any:
         if isinstance(x, float):
             return jnp.asarray(x, dtype)
         # A weakly typed array, such as `jnp.asarray(0.2)`, would be one more program to compile.
         return jnp.asarray(x, x.dtype) if isinstance(x, jax.Array) else x
 
-    for field in dataclasses.fields(system):
-        value = getattr(system, field.name)
-        if isinstance(value, System):
-            system = eqx.tree_at(lambda m, n=field.name: getattr(m, n), system, arrays_of(value, dtype))
-        if is_float_field(field) and isinstance(value, int) and not isinstance(value, bool):
-            system = eqx.tree_at(
-                lambda m, n=field.name: getattr(m, n), system, float(value), is_leaf=lambda x: x is None
-            )
-    return jax.tree.map(convert, system)
+    return jax.tree.map(convert, _with_floats(system))

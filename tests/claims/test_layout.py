@@ -16,6 +16,7 @@ ORDER = (
     "_types",
     "_numerics",
     "system",
+    "mechanics",
     "gallery",
     "flow",
     "derivatives",
