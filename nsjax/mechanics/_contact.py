@@ -163,6 +163,8 @@ class Contact(ForceElement):
 
     def distance(self, y: State) -> Number:
         """The gap."""
+        if self.gap is not None and set((self.along.slopes or {}).values()) == {-1}:
+            return self.gap - self.along.opposite.distance(y.q)
         d = self.along.distance(y.q)
         return d if self.gap is None else self.gap + d
 

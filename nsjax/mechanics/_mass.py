@@ -158,7 +158,7 @@ def _coriolis(mass: Callable[[Any], Entries], matrix: Entries, y: State) -> dict
         add(i, -rate * y.v[j])
         if i != j:
             add(j, -rate * y.v[i])
-    felt = dependence(changing, y.q).any(axis=0)
+    felt: Any = dependence(changing, y.q).any(axis=0)
     for k, name in enumerate(y.q._fields):
         if not felt[k]:
             continue

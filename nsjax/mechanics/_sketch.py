@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 WIDE = 1.0  # of a block
 APART = 2.6  # from one block to the next, middle to middle
-STEP = 0.36  # from one element to the next, between the same bodies
+STEP = 0.46  # from one element to the next, between the same bodies
 LINE = dict(color="0.15", linewidth=1.2, solid_capstyle="round")
 TEXT = dict(fontsize="small", color="0.15", ha="center")
 
@@ -101,11 +101,10 @@ class _Drawing:
             ax.text(middle + 0.5, y, name, va="center", **TEXT | dict(ha="left", style="italic"))
             self._draw_sides(ax, i, middle)
             self._draw_ground(ax, i, middle)
-            for n, (label, _) in enumerate(self.forces.get(i, [])):
-                y = self.high * (0.85 - 0.4 * n)
-                tip = middle + WIDE / 2
-                _arrow(ax, (tip, y), (tip + 0.5, y), 2.0, color="C3")
-                ax.text(tip + 0.28, y + 0.07, label, va="bottom", **TEXT | dict(color="C3"))
+            for n, (label, _) in enumerate(self.forces.get(i, []), 1):
+                y = self.high + 0.16 + 0.28 * n
+                _arrow(ax, (middle, y), (middle + 0.5, y), 2.0, color="C3")
+                ax.text(middle + 0.58, y, label, va="center", **TEXT | dict(color="C3", ha="left"))
         for (i, j), found in self.between.items():
             self._elements(ax, found, i * APART + WIDE / 2, j * APART - WIDE / 2)
         for n, (label, effect) in enumerate(self.loose):
@@ -144,7 +143,7 @@ class _Drawing:
         """What has no symbol between bodies."""
         blocks = [self.names.index(name) for name in felt(self.scene, label, effect)]
         x = np.mean([i * APART for i in blocks]) + 0.9 if blocks else n * APART
-        y = self.high + 0.62 + 0.42 * n
+        y = self.high + 0.5 + 0.28 * max(map(len, self.forces.values()), default=0) + 0.42 * n
         for i in blocks:
             ax.plot([i * APART, x], [self.high, y], **LINE | dict(linewidth=0.8, linestyle=(0, (4, 3)), zorder=0))
         ax.plot([x], [y], marker="o", markersize=7, markerfacecolor="white", **LINE)
