@@ -70,7 +70,7 @@ class Coordinate(Direction):
         return [(self.name, sign, force)]
 
     def check(self, owner: str, names: tuple[str, ...]) -> None:
-        _check_name(owner, self.name, names)
+        check_name(owner, self.name, names)
 
     @property
     def opposite(self) -> Direction:
@@ -117,7 +117,7 @@ class Combination(Direction):
 
     def check(self, owner: str, names: tuple[str, ...]) -> None:
         for name in self.names:
-            _check_name(owner, name, names)
+            check_name(owner, name, names)
 
     @property
     def opposite(self) -> Direction:
@@ -309,7 +309,8 @@ def _slopes_of(fn: Callable[[Any], Any], kind: Any, dtype: Any) -> dict[str, flo
     return found
 
 
-def _check_name(owner: str, name: str, names: tuple[str, ...]) -> None:
+def check_name(owner: str, name: str, names: tuple[str, ...]) -> None:
+    """Raises `ValueError` for a coordinate that the scene does not have."""
     if name not in names:
         raise ValueError(
             f"Effect `{owner}` must act along coordinates of the scene ({', '.join(names)}), but asks for `{name}`."

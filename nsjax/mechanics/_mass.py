@@ -15,6 +15,7 @@ from jax.core import Tracer
 from .._numerics._jaxpr import dependence, touched
 from .._numerics._linalg import solve_rows
 from .._numerics._text import did_you_mean
+from .._types import Scalar
 from ._direction import function
 from ._effect import Effect
 from ._state import coordinates_type, State
@@ -78,7 +79,7 @@ def accelerations(mass: Callable[[Any], Entries], y: State, forces: dict[str, An
     matrix = mass(y.q)
     for i, term in _coriolis(mass, matrix, y).items():
         right[i] = term if right[i] is None else right[i] + term
-    solved = _solved(matrix, right)
+    solved = _solved(matrix, right, jnp.asarray(y.v[0]))
     return [jnp.zeros_like(jnp.asarray(v)) if a is None else a for a, v in zip(solved, y.v)]
 
 
@@ -107,9 +108,11 @@ def _of_table(matrix: Any, names: Sequence[str]) -> Entries:
         return _placed(matrix, names, "The mass matrix")
     n = len(names)
     table: Any = matrix if isinstance(matrix, list | tuple | np.ndarray) else jnp.asarray(matrix)
-    shape = (len(table), *{jnp.shape(row) for row in table})
-    if shape not in ((n, (n,)), (n, n)) and not (isinstance(table, list | tuple) and all(len(r) == n for r in table)):
-        raise ValueError(f"The mass matrix must be {n} by {n}, for {', '.join(names)}, but has the rows {shape}.")
+    rows = [len(row) if isinstance(row, list | tuple) else jnp.shape(row) for row in table]
+    if not all(row in (n, (n,)) for row in rows) or len(rows) != n:
+        raise ValueError(
+            f"The mass matrix must be {n} by {n}, for {', '.join(names)}, but has {len(rows)} rows: {rows}."
+        )
     found: Entries = {}
     for i in range(n):
         for j in range(i, n):
@@ -178,15 +181,14 @@ def _table(matrix: Entries, n: int) -> Any:
     return [[matrix.get((min(i, j), max(i, j)), 0.0) for j in range(n)] for i in range(n)]
 
 
-def _solved(matrix: Entries, right: list[Any]) -> list[Any]:
-    """x with M x = right, where None stands for zero.
+def _solved(matrix: Entries, right: list[Any], like: Scalar) -> list[Any]:
+    """x with M x = right, where None stands for zero; `like` is a number of the state.
 
     By elimination without pivots, which a positive definite matrix does not need, written out for the entries that are
     there: a diagonal matrix costs one division for each force, a chain as much as it is long.
     """
     n, a, x = len(right), dict(matrix), list(right)
     if len(a) - n > _DENSE:
-        like = next(v for v in [*x, *a.values()] if isinstance(v, jax.Array))
         rows = [jnp.stack([jnp.asarray(m, like.dtype) for m in row]) for row in _table(a, n)]
         b = jnp.stack([jnp.zeros_like(like) if v is None else jnp.asarray(v, like.dtype) for v in x])
         return list(solve_rows(rows, b))

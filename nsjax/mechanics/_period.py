@@ -24,8 +24,6 @@ def multiple_of(periods: Mapping[str, Any]) -> int:
     if not others:
         return 1
     if any(isinstance(period, Tracer) for period in periods.values()):
-        if all(period is one for _, period in others):
-            return 1
         raise ValueError(
             f"The periods of {_listed(periods)} must be known numbers where the scene is made, so that their common "
             "one can be found; make it outside `jit`, and put the traced values in by `equinox.tree_at`."
@@ -48,8 +46,6 @@ def common(periods: Mapping[str, Any], multiple: int) -> Any:
     (first, one), *others = periods.items()
     period = one if multiple == 1 else multiple * one
     for name, other in others:
-        if other is one:
-            continue
         if isinstance(period, Tracer) or isinstance(other, Tracer):
             ratio = period / other
             off = jnp.abs(ratio - jnp.round(ratio)) > _EXACT * ratio

@@ -14,7 +14,7 @@ from .._types import Scalar
 from ..system._model import SwitchedSystem
 from ..system._switch import AbstractSwitch, within
 from ..system._system import arrays_of, SwitchValues, System
-from ._direction import signed_sum
+from ._direction import check_name, signed_sum
 from ._effect import Effect, ForceElement
 from ._instant import Instant
 from ._mass import accelerations, check_mass, Entries, entries, given_mass, MassFunction
@@ -145,6 +145,7 @@ class Scene(System):
         now, sums = Instant(self, t, y, s), {}
         for owner, effect in self.placed:
             for name, sign, value in now.terms(owner, effect):
+                check_name(owner, name, self.coordinates)
                 sums.setdefault(name, []).append((sign, value))
         forces = {name: signed_sum(terms) for name, terms in sums.items()}
         return State(y.v, type(y.v)(*accelerations(self._entries, y, forces)))

@@ -46,7 +46,7 @@ def numbers(module: Any) -> list[str]:
         value = getattr(module, field.name)
         if isinstance(value, Direction) or value is None:
             continue
-        if eqx.is_inexact_array_like(value) or isinstance(value, int):
+        if isinstance(value, int | float | jax.Array | np.ndarray | np.generic):
             found.append(f"{field.name} = {number(value)}")
         elif isinstance(value, eqx.Module) and field.name == "law":
             found += numbers(value)

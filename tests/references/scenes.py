@@ -53,7 +53,7 @@ class ImpactOscillator(nsjax.System):
     f_0: float = 0.8
     omega: float = 1.7
     e: float = 0.6
-    x_w: float = 1.0
+    x_w: float = 0.3
 
     def vector_field(self, t, y, s):
         force = self.f_0 * jnp.cos(self.omega * t) - s.wall
@@ -89,7 +89,7 @@ def impact_oscillator():
         spring=Spring("x", k=1.0),
         damper=Damper("x", c=0.05),
         drive=Harmonic("x", f_0=0.8, omega=1.7),
-        wall=Contact({"x": -1}, Rigid(e=0.6), gap=1.0),
+        wall=Contact({"x": -1}, Rigid(e=0.6), gap=0.3),
     )
 
 
