@@ -26,6 +26,8 @@ from ._friction_law import (
     StaticPoint as StaticPoint,
     Stribeck as Stribeck,
 )
+from ._model import SceneModel as SceneModel
+from ._rotor import FluidForce as FluidForce, stator_contact as stator_contact
 from ._scene import Scene as Scene
 from ._spring import (
     Backlash as Backlash,

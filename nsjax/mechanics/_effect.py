@@ -49,6 +49,11 @@ class Effect(eqx.Module):
         """What it adds to the mass matrix: `{"x": m}` on the diagonal, `{("x", "z"): m}` beside it, once."""
         return {}
 
+    def reaction(self, q: Any) -> Mapping[tuple[str, str], Number]:
+        """What accelerations of other coordinates do to one: `{("phi", "x"): m}` for m x'' on the left side of the
+        equation of phi. For inertia that is not symmetric, as where the torque of a force with added mass acts."""
+        return {}
+
     @property
     def adds_mass(self) -> bool:
         """Whether it has a `mass`."""

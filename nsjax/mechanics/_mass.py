@@ -16,7 +16,7 @@ from .._numerics._jaxpr import dependence, touched
 from .._numerics._linalg import solve_rows
 from .._numerics._text import did_you_mean
 from .._types import Scalar
-from ._direction import function
+from ._direction import check_name, function
 from ._effect import Effect
 from ._state import coordinates_type, State
 
@@ -73,13 +73,25 @@ def entries(mass: Any, effects: Sequence[tuple[str, Effect]], q: Any) -> Entries
     return total
 
 
-def accelerations(mass: Callable[[Any], Entries], y: State, forces: dict[str, Any]) -> list[Any]:
+def reactions(effects: Sequence[tuple[str, Effect]], q: Any) -> Entries:
+    """What is not symmetric in the inertia, by row and column."""
+    total: Entries = {}
+    for owner, effect in effects:
+        for (row, column), m in effect.reaction(q).items():
+            for name in (row, column):
+                check_name(owner, name, q._fields)
+            place = (q._fields.index(row), q._fields.index(column))
+            total[place] = total[place] + m if place in total else m
+    return total
+
+
+def accelerations(mass: Callable[[Any], Entries], reaction: Entries, y: State, forces: dict[str, Any]) -> list[Any]:
     """q'' of each coordinate, for the generalised forces on those that have any."""
     right = [forces.get(name) for name in y.q._fields]
     matrix = mass(y.q)
     for i, term in _coriolis(mass, matrix, y).items():
         right[i] = term if right[i] is None else right[i] + term
-    solved = _solved(matrix, right, jnp.asarray(y.v[0]))
+    solved = _solved(matrix, reaction, right, jnp.asarray(y.v[0]))
     return [jnp.zeros_like(jnp.asarray(v)) if a is None else a for a, v in zip(solved, y.v)]
 
 
@@ -181,22 +193,27 @@ def _table(matrix: Entries, n: int) -> Any:
     return [[matrix.get((min(i, j), max(i, j)), 0.0) for j in range(n)] for i in range(n)]
 
 
-def _solved(matrix: Entries, right: list[Any], like: Scalar) -> list[Any]:
+def _solved(matrix: Entries, reaction: Entries, right: list[Any], like: Scalar) -> list[Any]:
     """x with M x = right, where None stands for zero; `like` is a number of the state.
 
     By elimination without pivots, which a positive definite matrix does not need, written out for the entries that are
     there: a diagonal matrix costs one division for each force, a chain as much as it is long.
     """
     n, a, x = len(right), dict(matrix), list(right)
-    if len(a) - n > _DENSE:
-        rows = [jnp.stack([jnp.asarray(m, like.dtype) for m in row]) for row in _table(a, n)]
-        b = jnp.stack([jnp.zeros_like(like) if v is None else jnp.asarray(v, like.dtype) for v in x])
-        return list(solve_rows(rows, b))
+    if reaction:
+        a |= {(j, i): m for (i, j), m in matrix.items()}
+        for place, m in reaction.items():
+            a[place] = a[place] + m if place in a else m
+    if len(matrix) - n > _DENSE:
+        table = [[a.get((i, j), a.get((j, i), 0.0) if not reaction else 0.0) for j in range(n)] for i in range(n)]
+        rows = [jnp.stack([jnp.asarray(m, like.dtype) for m in row]) for row in table]
+        return list(solve_rows(rows, jnp.stack([jnp.asarray(0.0 if v is None else v, like.dtype) for v in x])))
     for k in range(n):
         beside = [j for j in range(k + 1, n) if (k, j) in a]
-        for i in beside:
-            factor = a[k, i] / a[k, k]
-            for j in (j for j in beside if j >= i):
+        below = [i for i in range(k + 1, n) if (i, k) in a] if reaction else beside
+        for i in below:
+            factor = a[(i, k) if reaction else (k, i)] / a[k, k]
+            for j in (j for j in beside if reaction or j >= i):
                 a[i, j] = _less(a.get((i, j)), factor * a[k, j])
             if x[k] is not None:
                 x[i] = _less(x[i], factor * x[k])

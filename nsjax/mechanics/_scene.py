@@ -17,7 +17,7 @@ from ..system._system import arrays_of, SwitchValues, System
 from ._direction import check_name, signed_sum
 from ._effect import Effect, ForceElement
 from ._instant import Instant
-from ._mass import accelerations, check_mass, Entries, entries, given_mass, MassFunction
+from ._mass import accelerations, check_mass, Entries, entries, given_mass, MassFunction, reactions
 from ._period import common, multiple_of
 from ._sketch import sketch
 from ._state import coordinates_type, State
@@ -148,7 +148,8 @@ class Scene(System):
                 check_name(owner, name, self.coordinates)
                 sums.setdefault(name, []).append((sign, value))
         forces = {name: signed_sum(terms) for name, terms in sums.items()}
-        return State(y.v, type(y.v)(*accelerations(self._entries, y, forces)))
+        reaction = reactions(self.placed, y.q)
+        return State(y.v, type(y.v)(*accelerations(self._entries, reaction, y, forces)))
 
     def _entries(self, q: Any) -> Entries:
         return entries(self.mass, self.placed, q)
