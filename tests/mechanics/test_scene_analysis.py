@@ -13,6 +13,7 @@ from nsjax.mechanics import (
     Coulomb,
     Damper,
     Falling,
+    ForceElement,
     Friction,
     Harmonic,
     Scene,
