@@ -166,6 +166,7 @@ def _mass_text(scene: "Scene", i: int) -> str:
 def _arrow(ax: "Axes", start: Any, end: Any, width: float, color: str = "0.15") -> None:
     style = dict(arrowstyle="-|>", linewidth=width, color=color, shrinkA=0, shrinkB=0)
     ax.annotate("", end, start, arrowprops=style)
+    ax.update_datalim([start, end])  # beyond the limits of the axes it would not be drawn
 
 
 def _hatch(ax: "Axes", start: Any, end: Any, side: int) -> None:

@@ -158,6 +158,9 @@ def test_sketches_are_drawn(scene):
     ax = scene.sketch()
     texts = {text.get_text() for text in ax.texts}
     assert {*scene.coordinates, *scene.effects} <= texts
+    ax.figure.draw_without_rendering()
+    for arrow in ax.texts:  # those of forces stand highest
+        assert arrow.get_text() or ax.viewLim.contains(*arrow.xy)
     other = nsjax.plot.sketch(scene.without(*scene.effects), ax=plt.figure().add_subplot())
     assert set(scene.coordinates) <= {text.get_text() for text in other.texts}
     plt.close("all")
