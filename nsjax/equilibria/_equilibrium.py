@@ -19,7 +19,7 @@ from ..derivatives._floquet import eigenvalues
 from ..flow._results import outcomes, RESULTS
 from ..orbits._orbit import ravel
 from ..system._impact import impact
-from ..system._mode import ModeState
+from ..system._mode import ModeState, OFF
 from ..system._model import SwitchedSystem
 from ..system._relay import relay
 from ..system._system import System
@@ -225,6 +225,9 @@ def _place(
         parts = jnp.stack(model.h(k, t, y))
         h, slack = jnp.min(parts), 1e3 * jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y)) + 1e-9
         on = jnp.abs(h) <= slack
+        if model.conditional(k):
+            absent, off = model.absent(k, state.mode), mode == OFF
+            h, on = jnp.where(off, jnp.where(absent, 1, -1), jnp.where(absent, -1, h)), on & ~off
         side = (h >= -slack) if isinstance(switch, impact) else (mode.astype(h.dtype) * h >= -slack)
         if k not in model.holdable:
             admissible, boundary = admissible & side, boundary | on

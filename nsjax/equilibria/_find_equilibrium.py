@@ -62,7 +62,7 @@ def find_equilibrium(
     system, y0, t, given, tol = checked_equilibrium(system, y0, t, mode, tol)
     model = SwitchedSystem.forwards(system, t, y0)
     names = [k.name for k in system.switches]
-    chosen = tuple(given.get(n, m) for n, m in zip(names, _mode_of(model, t, y0)))
+    chosen = model.present(tuple(given.get(n, m) for n, m in zip(names, _mode_of(model, t, y0))))
     newton = Newton(tol, max_iterations)
     found = equilibrium_in(system, t, y0, chosen, newton)
     concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, y0)))
@@ -159,6 +159,9 @@ def _in_all_modes(
 ) -> list[Equilibrium]:
     """What Newton's method finds from every start in every mode."""
     table = list(itertools.product(*_options(model, given)))
+    if table and any(map(model.conditional, range(len(table[0])))):
+        columns = model.present(tuple(np.array(table, np.int32).T))
+        table = list(dict.fromkeys(map(tuple, np.stack(columns, axis=1).tolist())))
     if len(table) > MODES:
         raise ValueError(f"Argument `mode` must leave at most {MODES} modes to be tried, but leaves {len(table)}.")
     number = len(jax.tree.leaves(starts)[0])

@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from ._scene import Scene
 
 
+def needed(owner: str, other: str) -> str:
+    """The path of an effect that `owner` needs, see `Effect.needs`."""
+    return owner.rpartition(".")[0] if other == ".." else other
+
+
 class Instant:
     """The forces at one instant, each worked out once: friction asks for that of its contact."""
 
@@ -27,10 +32,10 @@ class Instant:
     def values(self, owner: str, effect: Effect) -> SwitchValues:
         """The values of its own switches, and the forces that it needs."""
         own = {local: self._s[name] for local, name in self._names.get(owner, {}).items()}
-        needed = {}
+        forces = {}
         for local, other in effect.needs.items():
-            needed[local] = self.force(owner.rpartition(".")[0] if other == ".." else other)
-        return SwitchValues(type(effect).__name__, own | needed)
+            forces[local] = self.force(needed(owner, other))
+        return SwitchValues(type(effect).__name__, own | forces)
 
     def _raw(self, owner: str) -> Number:
         if owner not in self._found:

@@ -16,7 +16,7 @@ from ..system._switch import AbstractSwitch, within
 from ..system._system import arrays_of, SwitchValues, System
 from ._direction import check_name, signed_sum
 from ._effect import Effect, ForceElement
-from ._instant import Instant
+from ._instant import Instant, needed
 from ._mass import accelerations, check_mass, Entries, entries, given_mass, MassFunction, reactions
 from ._period import common, multiple_of
 from ._sketch import sketch
@@ -130,7 +130,16 @@ class Scene(System):
 
     @property
     def switches(self) -> tuple[AbstractSwitch, ...]:
-        return tuple(within(k, tuple(owner.split(".")), name) for owner, k, name in self.switches_of_effects)
+        found = self.switches_of_effects
+        effects, names = dict(self.placed), [name for _, _, name in found]
+
+        def condition(owner: str, switch: AbstractSwitch) -> str:
+            if switch.condition:
+                return f"{owner}.{switch.condition}"
+            contact = needed(owner, effects[owner].needs.get("normal", ""))
+            return contact if contact in names else ""  # a normal force may be there at all times
+
+        return tuple(within(k, tuple(owner.split(".")), name, condition(owner, k)) for owner, k, name in found)
 
     @property
     def switches_of_effects(self) -> list[tuple[str, AbstractSwitch, str]]:

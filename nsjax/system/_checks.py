@@ -11,10 +11,12 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from .._numerics._jaxpr import is_constant
+from .._numerics._text import did_you_mean
 from .._types import Scalar, Y
 from ._clock import clock
 from ._mode import ModeState
 from ._model import SwitchedSystem
+from ._switch import AbstractSwitch
 from ._system import is_number, System
 
 
@@ -67,6 +69,7 @@ def check_model(system: System, t: Scalar, y: Y, direction: Scalar) -> Scalar:
     for n in set(names):
         if names.count(n) > 1:
             raise ValueError(f"`{name}.switches` must have different names, but `{n}` occurs {names.count(n)} times.")
+    _check_conditions(name, switches)
     zeros = tuple(jnp.zeros((), t.dtype) for _ in switches)
 
     def field(s: tuple) -> Y:
@@ -90,6 +93,18 @@ def check_model(system: System, t: Scalar, y: Y, direction: Scalar) -> Scalar:
         switch.check(system, t, y, lambda sk, k=k: field(zeros[:k] + (sk,) + zeros[k + 1 :]))
     obstacle = one_way(system)
     return eqx.error_if(t, direction < 0, obstacle) if obstacle else t
+
+
+def _check_conditions(owner: str, switches: tuple[AbstractSwitch, ...]) -> None:
+    """Checks that what is there only while a contact is closed names a contact."""
+    contacts = {k.name: k for k in switches if not k.condition and not isinstance(k, clock)}
+    for k in switches:
+        if k.condition and k.condition not in contacts:
+            raise ValueError(
+                f"`{owner}.{k.name}.while_` must name a switch of the system that is there at all times, and no clock "
+                f"({', '.join(contacts) or 'there is none'}), but names `{k.condition}`."
+                + did_you_mean(k.condition, contacts)
+            )
 
 
 def one_way(system: System) -> str | None:

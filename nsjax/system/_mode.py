@@ -9,6 +9,7 @@ from jaxtyping import Array, Int
 from .._types import Mode
 
 
+OFF = 2  # the mode of friction whose contact is open
 BEYOND = 4  # added, with its sign, to the roots of a switch that is held with |λ| > 1 in backward time
 
 

@@ -19,13 +19,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._autodiff import frozen
 from .._numerics._jaxpr import dependence, is_affine, is_constant, touched
-from .._types import Scalar, Y
+from .._types import Mode, Scalar, Y
 from ._clocked import Clocked
 from ._coupling import Coupling
-from ._mode import BEYOND, ModeState, pick, put, Slot
+from ._mode import BEYOND, ModeState, OFF, pick, put, Slot
 from ._parameter import Path, put_parameter
 from ._sliding import linearised, project, resolved
 from ._system import System
+
+
+NONE = -1  # in place of a switch
 
 
 class SwitchedSystem(Clocked):
@@ -44,6 +47,7 @@ class SwitchedSystem(Clocked):
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # of `holdable`: whose surfaces may coincide
     coupling: Coupling = eqx.field(static=True)  # of `holdable`: which values act on which surfaces
     apart: tuple[bool, ...] = eqx.field(static=True)  # which have nothing to do with the mode of any other
+    contact: tuple[int, ...] = eqx.field(static=True)  # of each the switch while whose contact is closed it is there
     slots: tuple[Slot, ...] = eqx.field(static=True)
 
     def __init__(self, system: System, direction: Any, t: Scalar, y: Y):
@@ -104,6 +108,8 @@ class SwitchedSystem(Clocked):
                 if (seen[i] & seen[j]).any()
             )
         self.coupling, self.apart = self._coupled(t, y)
+        places = {switch.name: k for k, switch in enumerate(self.switches)} | {"": NONE}
+        self.contact = tuple(places[switch.condition] for switch in self.switches)
         slots = []
         for k, number in enumerate(self.parts):
             slots += [Slot(k, part, False) for part in range(number)]
@@ -180,6 +186,23 @@ class SwitchedSystem(Clocked):
         if self.static(k):
             edge = edge + jnp.where((self.direction < 0) & (jnp.abs(value) > 1 + slack), BEYOND * sign, 0)
         return edge
+
+    def conditional(self, k: int) -> bool:
+        """Whether switch k is there only while a contact is closed."""
+        return self.contact[k] != NONE
+
+    def absent(self, k: int, mode: Mode) -> Bool[Array, ""]:
+        """Whether switch k, a conditional one, is not there, as its contact is open."""
+        return ~self.switches[self.contact[k]].closed(mode[self.contact[k]])
+
+    def present(self, mode: Mode) -> Mode:
+        """The mode without what is not there."""
+        if not any(map(self.conditional, range(len(mode)))):
+            return mode
+        return tuple(
+            jnp.where(self.absent(k, mode), OFF, m).astype(jnp.int32) if self.conditional(k) else m
+            for k, m in enumerate(mode)
+        )
 
     def held(self, k: int, mode: Any) -> Bool[Array, ""]:
         """Whether `mode` of switch k holds the solution on its surface."""

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from typing import Any, Self, TYPE_CHECKING
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from .._numerics._jaxpr import is_affine
 from .._types import Guard, Scalar, Y
-from ._mode import BEYOND, ModeState, Slot
+from ._mode import BEYOND, ModeState, OFF, Slot
 from ._switch import AbstractSwitch
 
 
@@ -48,6 +48,35 @@ class sgn(AbstractSwitch):
         """Decorates `b(self)`, the bound >= 1 (dimensionless) which |λ| reaches before sliding ends."""
         return self._with(breakaway_fn=fn)
 
+    def while_(self, name: str) -> Self:
+        """The same switch, there only while a contact is closed: for friction that has the force of the contact as its
+        normal force.
+
+        ```python
+        @nsjax.sgn
+        def roll(self, t, y):          # sliding velocity
+            return y.v - self.R * y.omega
+
+        roll = roll.while_("wall")     # `wall` is another switch
+        ```
+
+        While the contact is open `s.roll` is 0, its mode is 2, and it has neither events nor multiplier. Where the
+        contact closes, its mode is decided anew: by the sign of h, or, on the surface, by the fields.
+
+        **Arguments:**
+
+        - `name`: of the switch that is the contact, closed while it rests if it is an `impact` (friction takes part
+            in each of its impacts too, up to where it stops the sliding), while its mode is not that of the open side
+            if it is a `sgn` (-1) or a `relay` (0).
+        """
+        return self._with(condition=name, modes=(*sgn.modes, OFF))
+
+    def closed(self, mode: Int[Array, ""]) -> Bool[Array, ""]:
+        return mode >= 0
+
+    def value(self, mode: Int[Array, ""], dtype: Any) -> Scalar:
+        return super().value(jnp.where(mode == OFF, 0, mode) if self.condition else mode, dtype)
+
     @property
     def static(self) -> bool:
         return self.breakaway_fn is not None
@@ -59,12 +88,14 @@ class sgn(AbstractSwitch):
         return (direction,) if direction else self.modes
 
     def words(self, mode: int) -> str:
-        return f"{self.name} {('= 0, slides', '> 0', '< 0')[mode]}"
+        return f"{self.name} {('= 0, slides', '> 0', 'off', '< 0')[mode]}"
 
     def guard_row(self, model: "SwitchedSystem", slot: Slot, t: Scalar, y: Y, state: ModeState) -> list[Scalar]:
         k, j = slot.switch, slot.part
         h, mode, part = model.h(k, t, y), state.mode[k], state.part[k]
         one = jnp.ones((), t.dtype)
+        if self.condition:
+            h = tuple(jnp.where(mode == OFF, one, hi) for hi in h)
         if len(h) == 1:
             return [jnp.where(mode == 0, one, mode.astype(t.dtype) * h[0])]
         # h = min(h_1, ..., h_J). Where h > 0 each component is watched alone; where h < 0 the event is the instant at

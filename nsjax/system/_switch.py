@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self, TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from .._types import Guard, Scalar, Y
 from ._mode import ModeState, pick, Slot
@@ -34,6 +34,7 @@ class AbstractSwitch(abc.ABC):
 
     guard: Guard
     name: str
+    condition: str = ""  # the name of the switch with whose closed contact alone it is there, see `sgn.while_`
     ends: tuple[int, ...] = ()  # where an event of this switch leads to one of these modes the solution ends
 
     def __init__(self, guard: Guard, *, name: str | None = None):
@@ -79,6 +80,10 @@ class AbstractSwitch(abc.ABC):
     def bound(self, system: "System") -> Any:
         """The largest |value| with which it can hold the solution."""
         return math.inf
+
+    def closed(self, mode: Int[Array, ""]) -> Bool[Array, ""]:
+        """Whether it is a contact that is closed in this mode."""
+        return mode == 1
 
     def next_mode(self, mode: Int[Array, ""], direction: Any) -> Int[Array, ""]:
         """Its mode after it has fired, as far as the mode before determines it."""
@@ -142,13 +147,15 @@ class AbstractSwitch(abc.ABC):
 
 
 @ft.cache  # switches are told apart by identity
-def within(switch: AbstractSwitch, path: tuple[str, ...], name: str) -> Any:
-    """The switch for a system in which the owner of the switch is found by the attributes of `path`."""
+def within(switch: AbstractSwitch, path: tuple[str, ...], name: str, condition: str = "") -> Any:
+    """The switch for a system in which the owner of the switch is found by the attributes of `path`; with the name that
+    the switch of its `condition` has there."""
 
     def forward(fn: Callable[..., Any]) -> Callable[..., Any]:
         return lambda self, *args: fn(ft.reduce(getattr, path, self), *args)
 
-    return switch._with(name=name, **{part: forward(fn) for part, fn in vars(switch).items() if callable(fn)})
+    new: Any = switch._with(name=name, **{part: forward(fn) for part, fn in vars(switch).items() if callable(fn)})
+    return new.while_(condition) if condition else new
 
 
 def forwarded(switch: AbstractSwitch) -> Any:

@@ -20,7 +20,7 @@ from ...equilibria._equilibrium import (
     stacked_values,
     switch_values,
 )
-from ...system._mode import ModeState
+from ...system._mode import ModeState, OFF
 from ...system._model import SwitchedSystem
 from ...system._parameter import put_parameter
 from ...system._relay import relay
@@ -136,6 +136,8 @@ class EquilibriumCurve(Curve):
             held = k in self.model.holdable and self.model.held(k, m)
             if what == "relay":
                 signs.append(-1 if i == m else 0)
+            elif m == OFF and self.model.conditional(k):
+                signs.append(0)
             elif what == "h" and held:
                 signs.append(int(number > 1 and i != part))
             elif what == "h":
@@ -155,7 +157,8 @@ class EquilibriumCurve(Curve):
         for k, switch in enumerate(self.model.switches):
             now = (int(mode[0, k]), int(mode[1, k]))
             if k not in touched:
-                options.append([now])
+                back = now[0] == OFF and self.model.conditional(k) and self.model.contact[k] in touched
+                options.append([(int(self.side(u, k)), now[1])] if back else [now])
                 continue
             if isinstance(switch, relay):
                 return [], [switch.name], False
@@ -170,7 +173,13 @@ class EquilibriumCurve(Curve):
                 options.append([(0, now[1])] + [(1, part) for part in parts] * (k in self.model.contacts))
                 continuous = False
         modes = [np.array(choice, np.int32).reshape(-1, 2).T for choice in itertools.product(*options)]
+        modes = [np.array([self.model.present(tuple(mode[0])), mode[1]], np.int32) for mode in modes]
         return modes, [self.model.switches[k].name for k in touched], continuous
+
+    def side(self, u: Array, k: int) -> Array:
+        """The sign of h of a switch."""
+        model, y, _ = self.at(u)
+        return jnp.sign(jnp.min(jnp.stack(model.h(k, self.t, y))))
 
     def entered(self, u: Array, mode: np.ndarray) -> Array:
         """The same place, with the values which switches have in another mode."""

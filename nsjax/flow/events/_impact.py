@@ -12,7 +12,7 @@ from ..._numerics._jaxpr import is_constant
 from ..._numerics._linalg import linear_solve
 from ..._types import Scalar, Y
 from ...system._impact import impact
-from ...system._mode import ModeState
+from ...system._mode import ModeState, OFF, put
 from ...system._model import SwitchedSystem
 
 
@@ -71,17 +71,25 @@ def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) ->
 
     s = model.values(t, y, state)
     for j in model.holdable:
-        if j in model.contacts or is_constant(lambda sj, j=j: hit(s[:j] + (sj,) + s[j + 1 :])[0], s[j]):
+        if j in model.contacts or is_constant(lambda sj, j=j, s=s: hit(put(s, (j,), (sj,)))[0], s[j]):
             continue
 
-        def slip(sj: Scalar, j: int = j) -> Scalar:
-            return model.level(j, t, hit(s[:j] + (sj,) + s[j + 1 :])[0], state)
+        begin, still = model.level(j, t, y, state), state.mode[j] == 0
+        if model.contact[j] == k:  # it is there for the instant of the impact
+            (noise,) = model.rounding(lambda t, y, j=j: (model.level(j, t, y, state),), t, y)
+            still = still | ((state.mode[j] == OFF) & (jnp.abs(begin) <= noise))
+            s = put(s, (j,), (jnp.where(state.mode[j] == OFF, jnp.where(still, 0, jnp.sign(begin)), s[j]),))
+
+        def slip(sj: Scalar, j: int = j, s: tuple = s) -> Scalar:
+            return model.level(j, t, hit(put(s, (j,), (sj,)))[0], state)
 
         # Where friction would reverse the sliding it ends it: the value that does so is found by one Newton step.
         end, slope = jax.jvp(slip, (s[j],), (jnp.ones_like(s[j]),))
-        reverses = (state.mode[j] != 0) & (model.level(j, t, y, state) * end < 0) & (slope != 0)
         stop = s[j] - end / jnp.where(slope == 0, 1, slope)
-        s = s[:j] + (jnp.where(reverses & (jnp.abs(stop) <= 1), stop, s[j]),) + s[j + 1 :]
+        new = jnp.where(~still & (begin * end < 0) & (slope != 0) & (jnp.abs(stop) <= 1), stop, s[j])
+        if model.contact[j] == k:  # what does not slide goes on so, as far as friction can keep it
+            new = jnp.where(still & (state.mode[j] == OFF) & (slope != 0), jnp.clip(stop, -1, 1), new)
+        s = put(s, (j,), (new,))
     return hit(s)
 
 

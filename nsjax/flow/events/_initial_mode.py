@@ -9,7 +9,7 @@ from ..._numerics._autodiff import frozen
 from ..._numerics._linalg import nearly
 from ..._types import Scalar, Y
 from ...system._impact import impact
-from ...system._mode import ModeState
+from ...system._mode import ModeState, OFF
 from ...system._model import SwitchedSystem
 from ...system._relay import relay
 from ...system._sgn import sgn
@@ -107,6 +107,8 @@ class _Start:
         self.on[k] = jnp.abs(h) <= noise
         if name in self.given:
             mode = jnp.asarray(self.given[name], jnp.int32)
+            if self.model.conditional(k):  # whether its contact is closed is seen later
+                mode = jnp.where(mode == OFF, jnp.where(jnp.abs(h) <= noise, 0, jnp.sign(h)).astype(jnp.int32), mode)
             # A state taken from an earlier solution may carry some drift off its surface.
             self.beyond[k] = jnp.where(mode == 0, jnp.abs(h), -mode.astype(h.dtype) * h) - 1e6 * noise
             self.chosen.append(k)
@@ -135,6 +137,8 @@ class _Start:
             # event's time. So the measure is how soon the surface is crossed, not how large h is.
             soon = AT_ONCE * float(jnp.finfo(t.dtype).eps) ** 0.5 * self.horizon
             off = gap > soon * jnp.abs(frozen(model.approach(k, t, y, state)))
+            if model.conditional(k):
+                off = off & ~model.absent(k, state.mode)
             contact = isinstance(model.switches[k], impact)
             failure = RESULTS.start_penetrates if contact else RESULTS.wrong_mode
             self.result = RESULTS.where(off, failure, self.result)
@@ -155,6 +159,8 @@ class _Start:
             part = 0 if state.part[k] is None else state.part[k]
             size = model.sizes(lambda t, y, k=k: model.h(k, t, y), t, y, jnp.ones_like(t), f)[part]
             fresh = jnp.where(jnp.abs(rate) > jnp.sqrt(jnp.finfo(t.dtype).eps) * size, 1, 2)
+            if model.conditional(k):
+                sign = jnp.where(sign == OFF, 0, sign)
             settled = jnp.zeros((), bool) if k in self.chosen else self.at.get(k, jnp.zeros((), bool))
             roots[k] = jnp.where(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
         return roots

@@ -58,6 +58,10 @@ class Instant(NamedTuple):
         """Whether its mode is to be chosen."""
         return jnp.zeros((), bool) if k in (self.given or ()) else self.at[k]
 
+    def absent(self, k: int, mode: dict[int, Any]) -> Bool[Array, ""]:
+        """Whether it is not there, as its contact is open."""
+        return self.model.absent(k, tuple(mode.values()))
+
     def side(self, k: int, slope: Scalar) -> Int[Array, ""]:
         """To which side one goes that leaves its surface: where both fields point beyond |λ| = 1, from a surface that
         repels to the other side."""
@@ -69,7 +73,7 @@ class Instant(NamedTuple):
         return True if self.starts else self.came[k] != 0
 
     def values(self, mode: dict[int, Any]) -> tuple[ModeState, tuple]:
-        trial = self.state._replace(mode=tuple(mode.values()))
+        trial = self.state._replace(mode=self.model.present(tuple(mode.values())))
         return trial, self.model.values(self.t, self.y, trial)
 
     def look(self, mode: dict[int, Any]) -> Outcome:
@@ -80,7 +84,7 @@ class Instant(NamedTuple):
         spans = slopes
         if model.holdable:
             _, matrix = model.linear(t, y, trial, s)
-            held = jnp.stack([model.held(k, mode[k]) for k in model.holdable])
+            held = jnp.stack([model.held(k, trial.mode[k]) for k in model.holdable])
             effects = attraction(model, matrix, held, self.pairs)
             slopes = slopes | {
                 k: matrix[i, i] if k in model.contacts else effects[i] for i, k in enumerate(model.holdable)
@@ -154,6 +158,10 @@ def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Ver
             sticks = (jnp.abs(s[k]) <= (1 + nearly(t)) * bound) & (leaves[k] == 0) & ~left
             law = jnp.where(held, sticks, jnp.where(leaves[k] == 0, goes, forced))
             strict = law & (held | (leaves[k] != 0) | (opening > small))
+            if model.conditional(k):  # what is not there has no choice: its first option stands for that
+                absent = here.absent(k, mode)
+                law, strict = (jnp.where(absent, held, x) for x in (law, strict))
+                held, crosses = held & ~absent, crosses & ~absent
             # Repulsion is no law, but a preference: a surface that repels may hold what has been on it so far, (2.25).
             repels = (slopes[k] >= 0) & (came[k] != 0) & ~here.grips(k, s[k])
             repelled = repelled | (at[k] & held & repels)
@@ -161,7 +169,8 @@ def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Ver
             turns = (leaves[k] != 0) & (came[k] != 0)  # it can only cross
             unmoved = jnp.where(came[k] == 0, 1, came[k])
             onward = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
-            law = strict = row[i] == jnp.where(turns, -came[k], onward)
+            law = row[i] == jnp.where(turns, -came[k], onward)
+            strict = law = jnp.where(here.absent(k, mode), row[i] == 1, law) if model.conditional(k) else law
         valid = valid & (~at[k] | (row[i] == came[k] if k in (here.given or ()) else law))
         sound, clear = sound & (~at[k] | law), clear & (~at[k] | strict)
         kept = held & (model.held(k, came[k]) if k in model.holdable else False)

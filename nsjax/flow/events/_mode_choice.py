@@ -57,7 +57,7 @@ def settle(
     which = tuple(at)
     false = jnp.zeros((), bool)
     if not which:
-        return state, false, false, false
+        return state._replace(mode=model.present(state.mode)), false, false, false
     here = Instant(model, t, y, state, at, leaves, given)
     mode = dict(enumerate(state.mode))
     trial = dict(mode)
@@ -78,6 +78,7 @@ def settle(
     _, rates, slopes, _ = seen
     if model.contacts and len(model.holdable) > 1:
         trial = _pinned(here, trial, rates)
+    trial = dict(zip(trial, model.present(tuple(trial.values()))))
     state, unsure = _entered(here, trial, seen, others, noise)
     forked = ft.reduce(jnp.logical_or, others.values())
     # At a two-fold n · f⁺ = n · f⁻ = 0, so that λ is 0/0 and no law says whether to stay or to leave. There is none
@@ -91,6 +92,7 @@ def settle(
             else:
                 # What is let go by a surface that has come to repel, beyond a two-fold, might have left it before.
                 several = (here.came[k] == 0) & (here.leaves[k] != 0) & (slopes[k] > 0)
+            several = several & ~here.absent(k, trial) if model.conditional(k) else several
             forked = forked | (here.at[k] & several)
     return state, unsure, forked, wrong
 
@@ -140,7 +142,10 @@ def _entered(
             if here.starts:
                 unsure = unsure | (here.open(k) & (trial[k] == 0) & (slopes[k] > 0) & others[k])
         held = model.held(k, trial[k]) if k in model.holdable else False
-        roots[k] = jnp.where(here.open(k), jnp.where(held, edge, fresh), roots[k]).astype(jnp.int32)
+        known = jnp.where(held, edge, fresh)
+        if model.conditional(k):
+            known = jnp.where(here.absent(k, trial), 0, known)
+        roots[k] = jnp.where(here.open(k), known, roots[k]).astype(jnp.int32)
     mode = tuple(m.astype(jnp.int32) for m in trial.values())
     return here.state._replace(mode=mode, roots=tuple(roots)), unsure
 
@@ -373,7 +378,8 @@ def _amend(here: Instant, trial: dict, seen: Outcome, noise: dict, apart: bool =
             against = -rates[k] * trial[k].astype(rates[k].dtype)
         excess.append(jnp.where(held, over, -1))
         # What has just left has its λ at the bound (or it crosses): dh/dt may be zero apart from rounding.
-        free = here.open(k) & ~held & (trial[k] != 0 if k not in model.contacts else True) & (here.leaves[k] == 0)
+        free = here.open(k) & ~here.absent(k, trial) if model.conditional(k) else here.open(k)
+        free = free & ~held & (trial[k] != 0 if k not in model.contacts else True) & (here.leaves[k] == 0)
         opposed.append(jnp.where(free & (against > 1e-10 * jnp.abs(slopes[k])), against, 0))
     # (A multiplier that is NaN is a violation too.)
     released = [~(over <= 0) for over in excess]

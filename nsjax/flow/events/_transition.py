@@ -12,7 +12,7 @@ from ..._numerics._bernstein import bend
 from ..._types import Scalar, Y
 from ...system._clock import clock
 from ...system._impact import impact
-from ...system._mode import ModeState
+from ...system._mode import ModeState, OFF
 from ...system._model import SwitchedSystem
 from ...system._relay import relay
 from ...system._sgn import sgn
@@ -194,6 +194,16 @@ class _Event:
             if model.clocks and self.parts[k] is not None:
                 nearest = jnp.argmin(jnp.stack(later.h(k, t, self.after))).astype(jnp.int32)
                 self.parts[k] = jnp.where(moved, nearest, self.parts[k])
+        if model.conditional(k):
+            # Where its contact closes it is met anew; where that stays open, the mode that it would have is dropped.
+            anew = self.state.mode[k] == OFF
+            h = jnp.stack(later.h(k, t, self.after))
+            slack, part = later.rounding(lambda t, y: later.h(k, t, y), t, self.after, self.size), jnp.argmin(h)
+            on = jnp.abs(h[part]) <= slack[part]
+            mode = jnp.where(anew, jnp.where(on, 0, jnp.sign(h[part])).astype(jnp.int32), mode)
+            roots[k], here = jnp.where(anew, 0, roots[k]), jnp.where(anew, on, here)
+            if self.parts[k] is not None:
+                self.parts[k] = jnp.where(anew, part.astype(jnp.int32), self.parts[k])
         self.modes[k], self.at[k] = mode, here
 
     def open_at_tick(self, k: int) -> None:

@@ -15,6 +15,7 @@ from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, R
 from ..._numerics._root import Newton
 from ..._types import Scalar
 from ...derivatives._floquet import floquet, structural_zeros
+from ...system._mode import OFF
 from ...system._model import SwitchedSystem
 from ._equations import OrbitCurve, row_sizes
 from ._itinerary import EVENT, OrbitItinerary, REPELLING_EXIT, TIME
@@ -351,6 +352,8 @@ def zeros_at_begin(curve: OrbitCurve, itinerary: OrbitItinerary) -> Array:
             continue
         free = jnp.ones(len(index), bool)
         order = jnp.ones(len(index))
+        if model.conditional(k):
+            left = left & (mode[:, k] != OFF)
         if k in model.holdable:
             free = ~model.held(k, mode[:, k])
             slid = model.held(k, mode_before[:, k])
