@@ -106,7 +106,7 @@ def test_slip_stick_slip_and_lift_off_in_closed_form():
     np.testing.assert_allclose(times, [halt, slips, lifts], rtol=1e-9)
     assert switches.tolist() == [1, 1, 0] and modes.tolist() == [[1, 0], [1, 1], [0, OFF]]
     np.testing.assert_allclose(sol.y1.u, c * (t1 - slips) - mu * a / 2 * (lifts - slips) ** 2, rtol=1e-9)
-    want = [t1 - slips, -a / 2 * (lifts - slips) ** 2 - (lifts - slips) * c / mu]
+    want = [t1 - slips, -a / 2 * (lifts - slips) ** 2]  # where it lets go its acceleration is zero
     np.testing.assert_allclose(slopes, want, rtol=1e-7)
 
 
@@ -114,17 +114,18 @@ def test_in_flight_nothing_happens_to_it():
     """Its velocity passes zero high above the floor; on the floor it sticks at once or slides, as it lands."""
     y0 = Plane(0.0, 1.0, 0.3, 0.0)
     sol = solve(Block(c=-1.0, a=0.0), 0.0, 1.0, y0)
-    (land, rests), switches, modes = logged(sol)
+    (land,), switches, modes = logged(sol)
     fall = np.sqrt(2 / 10)
     u, impulse = 0.3 - fall, 0.3 * 10 * fall
     assert 0 < -u < impulse  # the impact stops it, at once
     np.testing.assert_allclose(land, fall, rtol=1e-9)
-    assert sol.mode1.tolist() == [1, 0] and switches[0] == 0
-    np.testing.assert_allclose(rests, fall, rtol=1e-9)
+    assert switches.tolist() == [0] and modes.tolist() == [[1, 0]]
     np.testing.assert_allclose(sol.y1.u, 0, atol=1e-12)
-    slides = solve(Block(c=-1.0, a=0.0, mu=0.05), 0.0, 1.0, y0)
-    assert logged(slides)[1].tolist() == [0] and slides.mode1.tolist() == [1, -1]
-    np.testing.assert_allclose(slides.y1.u, u + 0.05 * 10 * fall + (0.05 * 10 - 1) * (1 - fall), rtol=1e-9)
+    for mu in (0.05, 0.02):  # it is stopped and slides off again; it slides on, and slower
+        slides = solve(Block(c=-1.0, a=0.0, mu=mu), 0.0, 1.0, y0)
+        assert logged(slides)[1].tolist() == [0] and slides.mode1.tolist() == [1, -1]
+        landed = min(u + mu * 10 * fall, 0)
+        np.testing.assert_allclose(slides.y1.u, landed + (mu * 10 - 1) * (1 - fall), rtol=1e-9)
 
 
 @pytest.mark.parametrize("lean, u", [(0.2, 0.0), (0.5, 0.2), (-0.5, -0.2)])
@@ -201,7 +202,7 @@ def followed(m, t1, y0):
 
 def test_on_a_soft_floor_as_scipy_has_it():
     """Bounces, with slip of both signs and stick: the floor lets go where its force vanishes."""
-    y0, t1 = (0.6, 0.3, 0.0, 0.0), 20.0
+    y0, t1 = (0.6, 0.3, 1.5, 0.0), 20.0
     sol = solve(Soft(), 0.0, t1, Plane(*y0), max_events=300, **TIGHT)
     times, switches, modes = logged(sol)
     np.testing.assert_allclose(list(sol.y1), followed(Soft(), t1, y0), rtol=1e-7, atol=1e-8)
@@ -213,7 +214,8 @@ def test_on_a_soft_floor_as_scipy_has_it():
 
 def test_orbit_and_derivative():
     """The orbit that the solution settles to, and its monodromy matrix, against differences of the period map."""
-    m, settled = Soft(), solve(Soft(), 0.0, 40 * np.pi, Plane(0.6, 0.3, 0.0, 0.0), max_events=2000)
+    m = Soft(c=8.0)
+    settled = solve(m, 0.0, 40 * np.pi, Plane(0.6, 0.3, 0.0, 0.0), max_events=2000)
     orbit = nsjax.find_orbit(m, settled.y1)
     assert (np.asarray(orbit.events.mode_after)[: int(orbit.events.num), 1] == OFF).any()
 
