@@ -145,7 +145,7 @@ def _mode_of(model: SwitchedSystem, t: Any, y: Y) -> list[Any]:
     modes = []
     for k, switch in enumerate(model.switches):
         if isinstance(switch, sgn):
-            h = jnp.min(jnp.stack(model.h(k, t, y)))
+            h = model.least(k, t, y)
             noise = jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y))
             on = 0 if k in model.holdable else 1
             modes.append(jnp.where(jnp.abs(h) <= noise, on, jnp.sign(h)).astype(jnp.int32))

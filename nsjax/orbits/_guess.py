@@ -91,7 +91,7 @@ def at_start(model: SwitchedSystem, t: Scalar, y: Y, given: Relays = None) -> An
     for k, switch in enumerate(model.switches):
         zero = jnp.zeros((), jnp.int32)
         if isinstance(switch, sgn):
-            h = jnp.min(jnp.stack(model.h(k, t, y)))
+            h = model.least(k, t, y)
             noise = jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y))
             zero = jnp.where(jnp.abs(h) <= 1e3 * noise, 0, jnp.sign(h)).astype(jnp.int32)
         elif isinstance(switch, relay):

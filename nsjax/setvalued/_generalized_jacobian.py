@@ -89,7 +89,7 @@ def generalized_jacobian(
         if not isinstance(switch, sgn):
             values.append(jnp.asarray(given.get(switch.name, 0), t.dtype))
             continue
-        h = jnp.min(jnp.stack(model.h(k, t, y)))
+        h = model.least(k, t, y)
         on += [k] * bool(jnp.abs(h) <= small)
         values.append(jnp.sign(h))
     surfaces = tuple(model.switches[k].name for k in on)

@@ -168,6 +168,11 @@ class SwitchedSystem(Clocked):
     def h(self, k: int, t: Scalar, y: Y) -> tuple[Scalar, ...]:
         return self.switches[k].components(self.system, self.time(t), y)
 
+    def least(self, k: int, t: Scalar, y: Y) -> Scalar:
+        """h of switch k, the least of its components. By comparisons, as XLA may work a component out twice, rounded
+        otherwise: `jnp.min` would find its minimum nowhere then, and have no derivative."""
+        return ft.reduce(lambda a, b: jnp.where(b < a, b, a), self.h(k, t, y))
+
     def bound(self, k: int) -> Any:
         return self.switches[k].bound(self.system)
 

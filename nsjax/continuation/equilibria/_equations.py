@@ -100,7 +100,7 @@ class EquilibriumCurve(Curve):
                 rows += switch.surfaces(model.system, self.t, y)
                 continue
             h = model.h(k, self.t, y)
-            rows += [*h, jnp.min(jnp.stack(h))] if len(h) > 1 else h
+            rows += [*h, model.least(k, self.t, y)] if len(h) > 1 else h
             if k not in model.holdable:
                 continue
             value = sigma[model.holdable.index(k)]
@@ -179,7 +179,7 @@ class EquilibriumCurve(Curve):
     def side(self, u: Array, k: int) -> Array:
         """The sign of h of a switch."""
         model, y, _ = self.at(u)
-        return jnp.sign(jnp.min(jnp.stack(model.h(k, self.t, y))))
+        return jnp.sign(model.least(k, self.t, y))
 
     def entered(self, u: Array, mode: np.ndarray) -> Array:
         """The same place, with the values which switches have in another mode."""

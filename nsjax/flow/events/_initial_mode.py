@@ -125,7 +125,7 @@ class _Start:
         for k in model.of_kind(sgn):
             if k not in self.chosen:
                 instant = 2 * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + self.horizon)
-                h = jnp.min(jnp.stack(model.h(k, t, y)))
+                h = model.least(k, t, y)
                 near = jnp.abs(h) <= instant * jnp.abs(frozen(model.approach(k, t, y, state)))
                 self.on[k] = self.at[k] = self.on[k] | near
                 self.modes[k] = jnp.where(self.on[k], 0, self.modes[k])

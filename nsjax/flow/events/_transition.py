@@ -181,8 +181,8 @@ class _Event:
         if model.of_kind(impact) or model.clocks:
             # An impact may carry the state across the surface, or off it, and a tick the surface across the state: the
             # switch follows at once.
-            h0 = jnp.min(jnp.stack(model.h(k, t, self.before)))
-            h1 = jnp.min(jnp.stack(later.h(k, t, self.after)))
+            h0 = model.least(k, t, self.before)
+            h1 = later.least(k, t, self.after)
             slack = jnp.max(later.rounding(lambda t, y: later.h(k, t, y), t, self.after, self.size))
             if model.clocks:  # time is shifted a little off a tick, to either side of it
                 shift, still = 2 * (model.margin(t) + later.margin(t)), jax.tree.map(jnp.zeros_like, self.after)
