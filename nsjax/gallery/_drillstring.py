@@ -1,12 +1,14 @@
 """The drillstring of Appendix A: a rotor that whirls in a stator filled with fluid, twists, and both.
 
-In polar coordinates a whirl is an equilibrium; in Cartesian ones the rotor may pass through the middle of the stator.
+In polar coordinates a whirl is an equilibrium; the Cartesian models, which are scenes, also see the rotor pass through
+the middle of its stator.
 """
 
 from typing import NamedTuple
 
 from .._types import Number, Scalar
 from ..mechanics._contact import Viscoelastic
+from ..mechanics._effect import Effect
 from ..mechanics._friction import Friction
 from ..mechanics._friction_law import Coulomb, Falling, falling
 from ..mechanics._model import SceneModel
@@ -18,25 +20,32 @@ from ..system._system import SwitchValues, System
 
 
 class Whirl(NamedTuple):
-    """State of the rotor in polar coordinates, without its angle, on which nothing depends."""
+    """State of a rotor in polar coordinates; on the angle of its middle nothing depends."""
 
-    r: Number  # displacement of its middle [m]
+    r: Number  # displacement of the middle [m]
     u: Number  # r' [m/s]
     Omega: Number  # whirl velocity α' [rad/s]
+
+
+class Twist(NamedTuple):
+    """State of a shaft that twists."""
+
+    phi: Number  # twist [rad]
+    w: Number  # φ' [rad/s]
 
 
 class TwistedWhirl(NamedTuple):
-    """The same, of a rotor on a shaft that twists."""
+    """State of a rotor on a shaft that twists."""
 
-    r: Number  # displacement of its middle [m]
+    r: Number  # displacement of the middle [m]
     u: Number  # r' [m/s]
     Omega: Number  # whirl velocity α' [rad/s]
-    phi: Number  # twist of the shaft [rad]
+    phi: Number  # twist [rad]
     w: Number  # φ' [rad/s]
 
 
 class _Rotor(System):
-    """The lateral motion of a rotor, with the angular velocity θ' with which it turns."""
+    """The parameters of a rotor, and its lateral motion."""
 
     m: float = 1.0  # mass [kg]
     c: float = 0.3  # damping of the shaft [N s/m]
@@ -48,33 +57,49 @@ class _Rotor(System):
     R: float = 2.0  # radius of the rotor [m]
     R_c: float = 1.0  # clearance between rotor and stator [m]
     k_b: float = 50.0  # stiffness of the stator [N/m]
-    c_b: float = 30.0  # damping of the stator [N s/m]
-    mu_b: float = 0.5  # friction coefficient of rotor and stator
-    omega: float = 2.0  # angular velocity of the drive [rad/s]; ours
+    c_b: float | None = 30.0  # damping of the stator [N s/m]
+    mu_b: float = 0.5  # friction coefficient of rotor and stator [-]
+    omega: float = 2.6  # angular velocity of the drive [rad/s]
 
-    def _contact(self, y: Whirl | TwistedWhirl) -> tuple[Number, Number]:
-        """Penetration and normal force; contact where both are positive."""
+    def _wall(self, y: Whirl | TwistedWhirl) -> tuple[Number, ...]:
+        """What is positive in contact: the penetration and the normal force."""
         depth = y.r - self.R_c
-        return depth, self.k_b * depth + self.c_b * y.u
+        return (depth,) if self.c_b is None else (depth, self.k_b * depth + self.c_b * y.u)
 
-    def _accelerations(self, y: Whirl | TwistedWhirl, turning: Number, N: Number, T: Number) -> tuple[Number, Number]:
-        """r'' and Ω' by (A.15), under the contact forces."""
+    def _normal_force(self, y: Whirl | TwistedWhirl, s: SwitchValues) -> Number:
+        depth, *force = self._wall(y)
+        return (force[0] if force else self.k_b * depth) * (1 + s.wall) / 2
+
+    def _accelerations(self, y: Whirl | TwistedWhirl, theta: Number, F_N: Number, F_T: Number) -> tuple[Number, Number]:
+        """r'' and α'' by (A.15) of a rotor that turns with the angular velocity `theta`, under the contact forces."""
         r, u, Omega = y.r, y.u, y.Omega
         mass, drag = self.m + self.m_f, self.D + self.B_2 * r**2
-        stiff = self.k - turning**2 / 4 * self.m_f + self.m_f * turning * Omega + self.B_1 * r**2
-        radial = (-(self.c + drag) * u - stiff * r - N) / mass + r * Omega**2
-        along = (self.m_f * turning * u + drag * turning / 2 * r - (self.c + drag) * Omega * r + T) / mass
+        stiff = self.k - theta**2 / 4 * self.m_f + self.m_f * theta * Omega + self.B_1 * r**2
+        radial = (-(self.c + drag) * u - stiff * r - F_N) / mass + r * Omega**2
+        along = (self.m_f * theta * u + drag * theta / 2 * r - (self.c + drag) * Omega * r + F_T) / mass
         return radial, (along - 2 * u * Omega) / r
 
 
-class PolarWhirl(_Rotor):
+class WhirlModel(_Rotor):
+    """Rotor that turns uniformly in a stator filled with fluid, in polar coordinates; section A.7, eq. (A.15), (A.16).
+
+        m_a (r'' - r Ω²) = -(c + D + B_2 r²) r' - (k - ω² m_f/4 + m_f ω Ω + B_1 r²) r - F_bN,   m_a = m + m_f
+        m_a (r Ω' + 2 r' Ω) = m_f ω r' + (D + B_2 r²) ω r/2 - (c + D + B_2 r²) Ω r + F_bT
+        F_bN = k_b (r - R_c) + c_b r'   where r > R_c and that is positive, else 0
+        F_bT = -μ_b F_bN Sgn(v_rel),    v_rel = r Ω + ω R;  rolling is v_rel = 0
+
+    Values of Appendix C.6; ω is ours. (A.5) as it is printed has no damping of the stator: that is `c_b=None`. But the
+    figures of the thesis come out with its c_b, with the contact law of section 3.5. Friction has its switch, `roll`,
+    only while there is contact. The middle of the stator, r = 0, is a singularity of these coordinates.
+    """
+
     def vector_field(self, t: Scalar, y: Whirl, s: SwitchValues) -> Whirl:
-        N = self._contact(y)[1] * (1 + s.wall) / 2
-        return Whirl(y.u, *self._accelerations(y, self.omega, N, -self.mu_b * s.roll * N))
+        F_N = self._normal_force(y, s)
+        return Whirl(y.u, *self._accelerations(y, self.omega, F_N, -self.mu_b * s.roll * F_N))
 
     @sgn
-    def wall(self, t: Scalar, y: Whirl) -> tuple[Number, Number]:
-        return self._contact(y)
+    def wall(self, t: Scalar, y: Whirl) -> tuple[Number, ...]:
+        return self._wall(y)
 
     @sgn
     def roll(self, t: Scalar, y: Whirl) -> Number:
@@ -83,25 +108,62 @@ class PolarWhirl(_Rotor):
     roll = roll.while_("wall")
 
 
-class PolarDrillstring(_Rotor):
+class TorsionModel(System):
+    """Rotor on a shaft that twists, with friction on its bit; section A.8, eq. (A.50), (A.9).
+
+        J φ'' = -k_φ φ + T_f,   T_f = -T_0 Sgn(θ')/(1 + δ |θ'|),   θ' = φ' + ω
+
+    Values of Appendix C.6, and ω of Fig. A.7a. (There is no stick phase any more at that ω.)
+    """
+
     J: float = 1.0  # moment of inertia [kg m^2]
     k_phi: float = 1.0  # torsional stiffness of the shaft [N m/rad]
     T_0: float = 0.2  # static friction torque on the bit [N m]
-    delta: float = 0.3  # fall of that torque with velocity [s/rad]
+    delta: float = 0.3  # fall of that torque with the velocity [s/rad]
+    omega: float = 2.0  # angular velocity of the drive [rad/s]
 
-    def vector_field(self, t: Scalar, y: TwistedWhirl, s: SwitchValues) -> TwistedWhirl:
-        turning = self.omega + y.w
-        N = self._contact(y)[1] * (1 + s.wall) / 2
-        T = -self.mu_b * s.roll * N
-        radial, around = self._accelerations(y, turning, N, T)
-        F_alpha = self.m * (y.r * around + 2 * y.u * y.Omega) + self.c * y.r * y.Omega - T
-        bit = -self.T_0 * falling(s.bit, turning, self.delta)
-        w = (-self.k_phi * y.phi + bit + T * self.R - F_alpha * y.r) / self.J
-        return TwistedWhirl(y.u, radial, around, y.w, w)
+    def vector_field(self, t: Scalar, y: Twist, s: SwitchValues) -> Twist:
+        T_f = -self.T_0 * falling(s.bit, y.w + self.omega, self.delta)
+        return Twist(y.w, (-self.k_phi * y.phi + T_f) / self.J)
 
     @sgn
-    def wall(self, t: Scalar, y: TwistedWhirl) -> tuple[Number, Number]:
-        return self._contact(y)
+    def bit(self, t: Scalar, y: Twist) -> Number:
+        return y.w + self.omega
+
+
+class _Drillstring(_Rotor):
+    """The parameters of a rotor that whirls on a shaft that twists."""
+
+    J: float = 1.0  # moment of inertia [kg m^2]
+    k_phi: float = 1.0  # torsional stiffness of the shaft [N m/rad]
+    T_0: float = 0.2  # static friction torque on the bit [N m]
+    delta: float = 0.3  # fall of that torque with the velocity [s/rad]
+    omega: float = 2.5  # angular velocity of the drive [rad/s]
+
+
+class DrillstringModel(_Drillstring):
+    """Rotor that whirls on a shaft that twists, in polar coordinates; section A.9, eq. (A.51).
+
+    The equations of `WhirlModel` with θ' = ω + φ' in the place of ω, and
+
+        J φ'' = -k_φ φ + T_f + T_b + T_d
+        T_f = -T_0 Sgn(θ')/(1 + δ |θ'|),   T_b = F_bT R,   T_d = -F_fα r
+
+    where F_fα is what the fluid does along α, its added mass too. Values of Appendix C.6; ω is ours.
+    """
+
+    def vector_field(self, t: Scalar, y: TwistedWhirl, s: SwitchValues) -> TwistedWhirl:
+        theta, F_N = self.omega + y.w, self._normal_force(y, s)
+        F_T = -self.mu_b * s.roll * F_N
+        radial, around = self._accelerations(y, theta, F_N, F_T)
+        # (A.14) says what the fluid's force is, from the motion.
+        fluid = self.m * (y.r * around + 2 * y.u * y.Omega) + self.c * y.r * y.Omega - F_T
+        T_f = -self.T_0 * falling(s.bit, theta, self.delta)
+        return TwistedWhirl(y.u, radial, around, y.w, (-self.k_phi * y.phi + T_f + F_T * self.R - fluid * y.r) / self.J)
+
+    @sgn
+    def wall(self, t: Scalar, y: TwistedWhirl) -> tuple[Number, ...]:
+        return self._wall(y)
 
     @sgn
     def roll(self, t: Scalar, y: TwistedWhirl) -> Number:
@@ -112,3 +174,42 @@ class PolarDrillstring(_Rotor):
     @sgn
     def bit(self, t: Scalar, y: TwistedWhirl) -> Number:
         return self.omega + y.w
+
+
+# The same in Cartesian coordinates.
+
+
+def _lateral(of: _Rotor, spin: str | None = None) -> dict[str, Effect]:
+    """What acts on the middle of a rotor."""
+    turns = dict(omega=of.omega, spin=spin)
+    law = Viscoelastic(of.k_b) if of.c_b is None else Viscoelastic(of.k_b, of.c_b)
+    return dict(
+        k_x=Spring("x", k=of.k),
+        k_y=Spring("y", k=of.k),
+        c_x=Damper("x", c=of.c),
+        c_y=Damper("y", c=of.c),
+        fluid=FluidForce("x", "y", of.m_f, of.D, B_1=of.B_1, B_2=of.B_2, **turns),
+        wall=stator_contact("x", "y", law, R_c=of.R_c, R=of.R, friction=Coulomb(of.mu_b), **turns),
+    )
+
+
+class WhirlScene(_Rotor, SceneModel):
+    """`WhirlModel` in Cartesian coordinates; eq. (A.13) with the forces (A.2), (A.8). A steady whirl is a periodic orbit
+    of period 2π/|Ω|, and the middle of the stator an equilibrium."""
+
+    @property
+    def scene(self) -> Scene:
+        return Scene(dict(x=self.m, y=self.m), **_lateral(self))
+
+
+class DrillstringScene(_Drillstring, SceneModel):
+    """`DrillstringModel` in Cartesian coordinates; eq. (A.13) and (A.51). With x = y = 0 it is `TorsionModel`."""
+
+    @property
+    def scene(self) -> Scene:
+        return Scene(
+            dict(x=self.m, y=self.m, phi=self.J),
+            **_lateral(self, "phi"),
+            shaft=Spring("phi", k=self.k_phi),
+            bit=Friction("phi", Falling(self.T_0, self.delta), v=-self.omega),
+        )

@@ -1,5 +1,6 @@
 """A rotor in a stator filled with fluid: the forces on the drillstring of Appendix A, in Cartesian coordinates."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 from .._types import Number
 from ..system._system import SwitchValues
 from ._contact import Contact, ContactLaw
-from ._direction import Direction, direction, Function, Velocity
+from ._direction import check_name, Direction, Term
 from ._effect import Effect
 from ._friction import Friction
 from ._friction_law import FrictionLaw
@@ -73,30 +74,79 @@ class FluidForce(Effect):
         return {(self.spin, self.x): self.m_f * z, (self.spin, self.y): -self.m_f * x}
 
 
-class _Radius(eqx.Module):
-    """The distance of the rotor's middle from that of the stator, with a derivative, zero, at zero too."""
+class _Polar(Direction):
+    """A direction in the plane of the rotor's middle. In the middle of the stator, where there is none, it is zero."""
 
     x: str = eqx.field(static=True)
     y: str = eqx.field(static=True)
+    sign: int = eqx.field(static=True, default=1, kw_only=True)
 
-    def __call__(self, q: Any) -> Number:
-        square = getattr(q, self.x) ** 2 + getattr(q, self.y) ** 2
-        there = square > 0
-        return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0)
+    def check(self, owner: str, names: tuple[str, ...]) -> None:
+        for name in (self.x, self.y):
+            check_name(owner, name, names)
+
+    @property
+    def opposite(self) -> Direction:
+        return dataclasses.replace(self, sign=-self.sign)
+
+    def _signed(self, value: Number) -> Number:
+        return value if self.sign == 1 else -value
+
+    def _middle(self, q: Any) -> tuple[Number, Number, Number]:
+        """x, y and r."""
+        x, y = getattr(q, self.x), getattr(q, self.y)
+        # Below rounding, but not zero, so that it can be divided by and has derivatives; told apart by a comparison,
+        # the middle of the stator would be a place where the guards may jump, which they would be searched for.
+        return x, y, jnp.sqrt(x**2 + y**2 + jnp.finfo(jnp.result_type(float, x, y)).eps ** 3)
 
 
-class _Rolling(eqx.Module):
-    """The velocity with which the rotor's surface moves along that of the stator, r α' + R spin'."""
+class _Radial(_Polar):
+    """The distance r of the rotor's middle from that of the stator."""
 
-    radius: _Radius
-    spin: Direction | None
+    def distance(self, q: Any) -> Number:
+        return self._signed(self._middle(q)[2])
+
+    def velocity(self, q: Any, v: Any) -> Number:
+        x, y, r = self._middle(q)
+        return self._signed((x * getattr(v, self.x) + y * getattr(v, self.y)) / r)
+
+    def terms(self, y: State, force: Number, sign: int) -> list[Term]:
+        x, z, r = self._middle(y.q)
+        pull = force / r
+        return [(self.x, sign * self.sign, pull * x), (self.y, sign * self.sign, pull * z)]
+
+    def __str__(self) -> str:
+        return f"{'-' * (self.sign < 0)}hypot({self.x}, {self.y})"
+
+
+class _Around(_Polar):
+    """The velocity r α' + R spin' of the rotor's surface along that of the stator."""
+
+    spin: str | None = eqx.field(static=True)
     R: float
 
-    def __call__(self, q: Any, v: Any) -> Number:
-        (x, y), r = (self.radius.x, self.radius.y), self.radius(q)
-        around = getattr(q, x) * getattr(v, y) - getattr(q, y) * getattr(v, x)
-        w = around / jnp.where(r > 0, r, 1.0)
-        return w if self.spin is None else w + self.R * self.spin.velocity(q, v)
+    def distance(self, q: Any) -> Number:
+        raise ValueError("The velocity of a rotor's surface is no derivative of a distance.")
+
+    def velocity(self, q: Any, v: Any) -> Number:
+        x, y, r = self._middle(q)
+        w = (x * getattr(v, self.y) - y * getattr(v, self.x)) / r
+        return self._signed(w if self.spin is None else w + self.R * getattr(v, self.spin))
+
+    def terms(self, y: State, force: Number, sign: int) -> list[Term]:
+        x, z, r = self._middle(y.q)
+        push = force / r
+        found = [(self.x, -sign * self.sign, push * z), (self.y, sign * self.sign, push * x)]
+        return found if self.spin is None else [*found, (self.spin, sign * self.sign, self.R * force)]
+
+    def check(self, owner: str, names: tuple[str, ...]) -> None:
+        super().check(owner, names)
+        if self.spin is not None:
+            check_name(owner, self.spin, names)
+
+    def __str__(self) -> str:
+        turn = "" if self.spin is None else f" + R {self.spin}'"
+        return f"{'-(' * (self.sign < 0)}r alpha'{turn}{')' * (self.sign < 0)}"
 
 
 def stator_contact(
@@ -128,9 +178,8 @@ def stator_contact(
 
     **Returns:** a `Contact`.
     """
-    radius = _Radius(x, y)
     rubs = None
     if friction is not None:
-        along = _Rolling(radius, None if spin is None else direction(spin), float(R) if isinstance(R, int) else R)
-        rubs = Friction(Velocity(along), friction, v=None if omega is None else -omega * R)
-    return Contact(Function(radius, -1), law, gap=R_c, friction=rubs)
+        around = _Around(x, y, spin, float(R) if isinstance(R, int) else R)
+        rubs = Friction(around, friction, v=None if omega is None else -omega * R)
+    return Contact(_Radial(x, y, sign=-1), law, gap=R_c, friction=rubs)
