@@ -14,9 +14,10 @@ from .._types import Y
 from .._version import __version__
 from ..derivatives._saltation import saltation_matrices
 from ..flow._results import RESULTS
-from ..flow._solution import Events, Solution
+from ..flow._solution import Event, Events, Solution
 from ..orbits._orbit import Orbit
 from ..plot import components
+from ..system._mode import change_words
 from ..system._system import System
 from ._job import Job
 from ._mistakes import advice
@@ -86,9 +87,8 @@ def _number(x: Any) -> str:
     return f"{float(x):.10g}"
 
 
-def _change(switch: str, before: dict[str, int], after: dict[str, int]) -> str:
-    changes = [f"{n} {before[n]:+d} -> {after[n]:+d}" for n in before if before[n] != after[n]]
-    return ", ".join(changes) or "reset"
+def _change(event: Event) -> str:
+    return change_words(event.mode_before, event.mode_after) or "reset"
 
 
 def _event_table(events: Events, units: Units, most: int) -> str:
@@ -96,7 +96,7 @@ def _event_table(events: Events, units: Units, most: int) -> str:
     for i in range(min(len(events), most)):
         e = events[i]
         values = [_number(x) for x in components(e.y_after).values()]
-        rows.append([f"{float(e.t):.13g}", e.switch, _change(e.switch, e.mode_before, e.mode_after), *values])
+        rows.append([f"{float(e.t):.13g}", e.switch, _change(e), *values])
     left = len(events) - most
     return _table(rows) + (f"\n  ... and {left} more" if left > 0 else "")
 
@@ -157,7 +157,7 @@ def _orbit_text(job: Job, orbit: Orbit, units: Units) -> str:
         parts.append("events of the orbit\n" + _event_table(orbit.events, units, len(orbit.events)))
         matrices = _linearised(job.system, orbit.events)
         for i, e in enumerate(orbit.events):
-            change = _change(e.switch, e.mode_before, e.mode_after)
+            change = _change(e)
             parts.append(f"saltation matrix at t = {_number(e.t)}, {e.switch}: {change}\n" + _matrix(matrices[i]))
     parts.append("monodromy matrix\n" + _matrix(orbit.monodromy))
     return "\n\n".join(parts)

@@ -19,7 +19,7 @@ from ..derivatives._floquet import eigenvalues
 from ..flow._results import outcomes, RESULTS
 from ..orbits._orbit import ravel
 from ..system._impact import impact
-from ..system._mode import ModeState, OFF
+from ..system._mode import mode_words, ModeState, OFF
 from ..system._model import SwitchedSystem
 from ..system._relay import relay
 from ..system._system import System
@@ -71,7 +71,7 @@ class Equilibrium(eqx.Module, Generic[StateT]):
                 f"{stable.sum()} stable, {(~stable).sum()} unstable"
             )
         names = [k.name for k in self.system.switches]
-        where = ", ".join(f"{n} {int(m):+d}" for n, m in zip(names, self.mode)) or "no switches"
+        where = mode_words(names, self.mode) or "no switches"
         values = ", ".join(f"{n} {float(v):.6g}" for n, v in zip(names, self.multipliers)) or "none"
         free = len(self.eigenvalues) - int(self.held)
         words = ["stable" if self.stable else "unstable"] + ["virtual"] * (not self.admissible)

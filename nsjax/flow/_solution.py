@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._text import between, known, shown, written
 from .._types import Scalar, StateT, Y
+from ..system._mode import change_words, mode_words
 from ..system._system import System
 from ._results import is_okay, outcomes, RESULTS
 from .steppers._stepper import bernstein
@@ -29,10 +30,9 @@ class Event(NamedTuple, Generic[StateT]):
     transversality: Any
 
     def __str__(self) -> str:
-        before, after = self.mode_before, self.mode_after
-        changes = [f"{n} {before[n]:+d} -> {after[n]:+d}" for n in before if before[n] != after[n]] or ["reset"]
+        changes = change_words(self.mode_before, self.mode_after) or "reset"
         state = ", ".join(f"{x:.6g}" for x in np.concatenate([np.ravel(l) for l in jax.tree.leaves(self.y_after)]))
-        return f"t = {float(self.t):<18.12g} {self.switch}: {', '.join(changes)}   y = ({state})"
+        return f"t = {float(self.t):<18.12g} {self.switch}: {changes}   y = ({state})"
 
 
 @shown
@@ -128,7 +128,7 @@ class Itinerary(eqx.Module):
     def __str__(self) -> str:
         if jnp.ndim(self.num):
             return f"itineraries of {self.num.size} solutions, {between(self.num)} events each"
-        return " -> ".join(", ".join(f"{n} {m:+d}" for n, m in row.items()) for row in self)
+        return " -> ".join(mode_words(row, row.values()) for row in self)
 
 
 def _clipped(x: Array, low: Any, high: Any) -> Array:
@@ -205,7 +205,7 @@ class Solution(eqx.Module, Generic[StateT]):
                 + f"\n  {np.sum(~np.asarray(self.unique))} not unique"
                 * (not np.all(self.unique))
             )
-        modes = ", ".join(f"{n} {int(m):+d}" for n, m in zip(self.events.names, self.mode1))
+        modes = mode_words(self.events.names, self.mode1)
         text = (
             f"solution of {owner} from t = {float(self.t0):.10g} to {float(self.t1):.10g}\n"
             f"  result  {RESULTS[self.result]}\n"

@@ -9,6 +9,16 @@ from ._block import (
     SmoothBlock as SmoothBlock,
     StaticPointBlock as StaticPointBlock,
 )
+from ._drillstring import (
+    DrillstringModel as DrillstringModel,
+    DrillstringScene as DrillstringScene,
+    TorsionModel as TorsionModel,
+    Twist as Twist,
+    TwistedWhirl as TwistedWhirl,
+    Whirl as Whirl,
+    WhirlModel as WhirlModel,
+    WhirlScene as WhirlScene,
+)
 from ._examples import (
     AttractionSliding as AttractionSliding,
     Line as Line,

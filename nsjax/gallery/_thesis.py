@@ -10,6 +10,16 @@ from typing import Any
 from .._types import Y
 from ..system._system import System
 from ._block import FallingFrictionBlock, Slip, SmoothBlock, StaticPointBlock
+from ._drillstring import (
+    DrillstringModel,
+    DrillstringScene,
+    TorsionModel,
+    Twist,
+    TwistedWhirl,
+    Whirl,
+    WhirlModel,
+    WhirlScene,
+)
 from ._examples import (
     AttractionSliding,
     Line,
@@ -67,6 +77,7 @@ class Entry:
     t0: float = 0.0  # start time [s]
     orbit: OrbitGuess | None = None
     also: tuple[str, ...] = ()  # other numbers of the system in the thesis
+    cartesian: Callable[..., System] | None = None  # of a system in polar coordinates: the same in Cartesian ones
 
 
 # The guesses come from simulations outside this library (scipy, the mechanical reading of the friction laws), and are
@@ -86,6 +97,8 @@ _ORBITS = {
     "6.7": OrbitGuess(Motion(2.0, 0.0), period=12.635),
     "6.8": OrbitGuess(Motion(4.013, 1.475)),
     "6.9": OrbitGuess(Motion(0.1992, 0.4542), order=2),
+    "A.8": OrbitGuess(Twist(-2.1307, 0.4496), period=6.296),
+    "A.9": OrbitGuess(TwistedWhirl(1.0197, 0.2029, 0.7161, 1.9272, -0.8771), period=5.402),
 }
 
 _ENTRIES = (
@@ -171,6 +184,25 @@ _ENTRIES = (
         t1=100.0,
     ),
     Entry("6.9", "Forced stick-slip system: discontinuous fold-flip", ForcedStickSlip, y0=Motion(1.0, 0.0), t1=80.0),
+    Entry(
+        "A.7",
+        "Whirl of a rotor in its stator",
+        WhirlModel,
+        y0=Whirl(0.9, 0.3, 0.2),
+        t1=60.0,
+        also=("(A.15)", "(A.16)"),
+        cartesian=WhirlScene,
+    ),
+    Entry("A.8", "Stick-slip of a drillstring", TorsionModel, y0=Twist(1.0, 0.0), t1=60.0, also=("(A.50)",)),
+    Entry(
+        "A.9",
+        "Stick-slip and whirl of a drillstring",
+        DrillstringModel,
+        y0=TwistedWhirl(0.5, 0.0, 0.3, 0.0, 0.5),
+        t1=60.0,
+        also=("(A.51)",),
+        cartesian=DrillstringScene,
+    ),
 )
 
 THESIS: Mapping[str, Entry] = MappingProxyType(
@@ -193,16 +225,18 @@ _WORDS = {
 }
 
 
-def _parse(key: str) -> tuple[str, tuple[int, ...]] | None:
-    """Kind and numbers of a key: "Eq. (2.3)" is ("equation", (2, 3)). A bare "2.3" has the kind ""."""
-    match = re.fullmatch(r"([a-z§]*)\.?(\(?\d+\.\d+\)?)(?:\.?\(?(\d)\)?)?", "".join(key.lower().split()))
+def _parse(key: str) -> tuple[str, tuple[str, ...]] | None:
+    """Kind and numbers of a key: "Eq. (2.3)" is ("equation", ("2", "3")). A bare "2.3" has the kind ""."""
+    text = "".join(key.lower().split())
+    match = re.fullmatch(r"([a-z§]*?)\.?(\(?(?:\d+|a)\.\d+\)?)(?:\.?\(?(\d)\)?)?", text)
     if match is None or match[1] not in _WORDS:
         return None
     kind = _WORDS[match[1]] or ("equation" if match[2].startswith("(") else "")
-    return kind, tuple(int(n) for n in re.findall(r"\d+", key))
+    numbers = re.findall(r"\d+|a", match[2])
+    return kind, tuple(n.lstrip("0") for n in [*numbers, *([match[3]] if match[3] else [])])
 
 
-def _kind(key: str) -> tuple[str, tuple[int, ...]]:
+def _kind(key: str) -> tuple[str, tuple[str, ...]]:
     parsed = _parse(key)
     assert parsed is not None
     kind, numbers = parsed
@@ -232,7 +266,7 @@ def entry(key: str) -> Entry:
     return fitting.get("section") or next(iter(fitting.values()))
 
 
-def thesis(key: str, **parameters: Any) -> System:
+def thesis(key: str, *, coordinates: str | None = None, **parameters: Any) -> System:
     """A system of the thesis, with the values of its Appendix C where it has any.
 
     ```python
@@ -242,13 +276,19 @@ def thesis(key: str, **parameters: Any) -> System:
     **Arguments:**
 
     - `key`: number of the section, equation or example; see `THESIS`. `entry(key)` has more than the system.
+    - `coordinates`: "cartesian" for the whirl of "A.7" and "A.9" as a scene in Cartesian coordinates, which are polar
+        ones otherwise.
     - `parameters`: values that replace the defaults, under the names of the thesis's symbols.
 
     **Returns:** the `System`; its docstring states equations, sources and which values are not the thesis's.
 
-    **Raises:** `ValueError` for an unknown key or parameter.
+    **Raises:** `ValueError` for an unknown key or parameter, or coordinates that the system is not given in.
     """
-    system = entry(key).system
+    found = entry(key)
+    system = found.cartesian if coordinates == "cartesian" else found.system
+    if system is None or coordinates not in (None, "cartesian", *(["polar"] if found.cartesian else [])):
+        have = "'polar' or 'cartesian'" if found.cartesian else f"left out for {key!r}"
+        raise ValueError(f"Argument `coordinates` must be {have}, but got {coordinates!r}.")
     known = [field.name for field in dataclasses.fields(system())]
     for name in parameters:
         if name not in known:

@@ -1,6 +1,6 @@
 """The mode of a system: one small integer for each switch."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -48,3 +48,17 @@ def put(values: tuple[Any, ...], which: Sequence[int], new: Sequence[Any]) -> tu
     """The same values, with others in some places."""
     found = dict(zip(which, new))
     return tuple(found.get(i, v) for i, v in enumerate(values))
+
+
+def mode_words(names: Iterable[str], mode: Iterable[Any]) -> str:
+    """A mode as it is printed."""
+    return ", ".join(f"{name} {_word(m)}" for name, m in zip(names, mode))
+
+
+def change_words(before: Mapping[str, int], after: Mapping[str, int]) -> str:
+    """What changes in a mode, as it is printed; empty if nothing does."""
+    return ", ".join(f"{n} {_word(m)} -> {_word(after[n])}" for n, m in before.items() if m != after[n])
+
+
+def _word(mode: Any) -> str:
+    return "off" if int(mode) == OFF else f"{int(mode):+d}"

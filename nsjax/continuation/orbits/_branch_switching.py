@@ -10,6 +10,7 @@ from ...maps._corner_normal_form import Cycle
 from ...orbits.segments._equations import linearised, OrbitCurve
 from ...orbits.segments._itinerary import capacity_for, OrbitItinerary, Start, TIME
 from ...orbits.segments._point import correct, Plane, state_at
+from ...system._mode import mode_words
 from ._bifurcation import OrbitBifurcation, OrbitHalfBranch
 from ._test_functions import CORNERS
 from ._tracer import alike, midpoint, OrbitPoint, OrbitTracer, spot_of, test_values, turned, Zero
@@ -204,5 +205,4 @@ def half_branch_of(half: Departure) -> OrbitHalfBranch:
 
 def itinerary_text(curve: OrbitCurve, itinerary: OrbitItinerary) -> str:
     names = [k.name for k in curve.model.switches]
-    rows = [", ".join(f"{n} {int(m):+d}" for n, m in zip(names, itinerary.mode[i])) for i in itinerary.rows]
-    return " -> ".join(rows)
+    return " -> ".join(mode_words(names, itinerary.mode[i]) for i in itinerary.rows)

@@ -59,6 +59,9 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
     # Several places may be touched at once, by symmetry, and the event happen at some of them only.
     alike = ("duration", "margin") if kind in ("duration", "margin") else (kind,)
     kinds = {t.row: t.kind for t in (*zero.others, zero.test) if t.kind in alike}
+    # Where a segment vanishes, the one before it ends at the same place.
+    vanished = [row for row, what in kinds.items() if what == "duration"]
+    kinds = {r: k for r, k in kinds.items() if k == "duration" or (r + 1) % int(spot.itinerary.num) not in vanished}
     rows = list(kinds)
     bounces = kind == "rate" and all(is_impact(curve, spot, row) for row in rows)
     if kind == "rate" and not bounces:

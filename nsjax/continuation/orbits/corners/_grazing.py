@@ -19,8 +19,20 @@ FOUND = 3e-3  # how far from a point where the equations are singular the orbit 
 def exactly(tracer: OrbitTracer, zero: Zero) -> Zero | None:
     """A corner by equations that are smooth and regular there; None if its grazing is not found."""
     if zero.test.kind == "guard":
-        return grazing_at(tracer, zero)
+        return landing_at(tracer, zero) or grazing_at(tracer, zero)
     return (touching_at(tracer, zero) or zero) if zero.test.kind in ("duration", "rate") else zero
+
+
+def landing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
+    """Where a surface can only just hold what comes onto it: a corner at the event, like that of orbits that cross it
+    there and can only just do so. None if the guard vanishes elsewhere."""
+    look, itinerary, slots = zero.spot.look, zero.spot.itinerary, tracer.curve.model.slots
+    i, n = zero.test.row, int(itinerary.num)
+    before, after = slots[int(itinerary.slot[i - 1 if i else n - 1])], slots[zero.test.slot]
+    comes = n > 1 and itinerary.ends[i - 1 if i else n - 1] == EVENT and not before.holding
+    if look.where[zero.test.row, zero.test.slot] > 0 or not (comes and after.holding and before.switch == after.switch):
+        return None
+    return zero._replace(test=Test("margin", i - 1 if i else n - 1), others=())
 
 
 def touching_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
