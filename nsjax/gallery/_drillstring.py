@@ -194,8 +194,8 @@ def _lateral(of: _Rotor, spin: str | None = None) -> dict[str, Effect]:
 
 
 class WhirlScene(_Rotor, SceneModel):
-    """`WhirlModel` in Cartesian coordinates; eq. (A.13) with the forces (A.2), (A.8). A steady whirl is a periodic orbit
-    of period 2π/|Ω|, and the middle of the stator an equilibrium."""
+    """`WhirlModel` in Cartesian coordinates; eq. (A.13) with the forces (A.2), (A.8). A steady whirl is a periodic
+    orbit of period 2π/|Ω|, and the middle of the stator an equilibrium."""
 
     @property
     def scene(self) -> Scene:
