@@ -138,7 +138,7 @@ class _Drillstring(_Rotor):
     k_phi: float = 1.0  # torsional stiffness of the shaft [N m/rad]
     T_0: float = 0.2  # static friction torque on the bit [N m]
     delta: float = 0.3  # fall of that torque with the velocity [s/rad]
-    omega: float = 2.5  # angular velocity of the drive [rad/s]
+    omega: float = 3.05  # angular velocity of the drive [rad/s]
 
 
 class DrillstringModel(_Drillstring):
@@ -149,7 +149,8 @@ class DrillstringModel(_Drillstring):
         J φ'' = -k_φ φ + T_f + T_b + T_d
         T_f = -T_0 Sgn(θ')/(1 + δ |θ'|),   T_b = F_bT R,   T_d = -F_fα r
 
-    where F_fα is what the fluid does along α, its added mass too. Values of Appendix C.6; ω is ours.
+    where F_fα is what the fluid does along α, its added mass too. Values of Appendix C.6; ω is ours: on the stable
+    part of branch P4 (Fig. A.10), beside which rolling (E4) is stable too.
     """
 
     def vector_field(self, t: Scalar, y: TwistedWhirl, s: SwitchValues) -> TwistedWhirl:

@@ -98,7 +98,7 @@ _ORBITS = {
     "6.8": OrbitGuess(Motion(4.013, 1.475)),
     "6.9": OrbitGuess(Motion(0.1992, 0.4542), order=2),
     "A.8": OrbitGuess(Twist(-2.1307, 0.4496), period=6.296),
-    "A.9": OrbitGuess(TwistedWhirl(1.0197, 0.2029, 0.7161, 1.9272, -0.8771), period=5.402),
+    "A.9": OrbitGuess(TwistedWhirl(0.4416, -0.2358, 1.1212, -2.5320, 0.5731), period=5.0),
 }
 
 _ENTRIES = (

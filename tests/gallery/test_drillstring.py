@@ -1,8 +1,6 @@
 """The drillstring of Appendix A against closed forms, and against scipy on equations in the complex plane."""
 
 import itertools
-import sys
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -10,6 +8,8 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from drillstring import B_1, BETA, C, C_B, D, DELTA, drillstring, K, K_B, M, M_A, M_F, MU, R, R_C, T_0
+from programs import equations_of
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -17,40 +17,6 @@ import nsjax
 from nsjax import gallery
 from nsjax._types import Number
 from nsjax.gallery import DrillstringScene, Twist, TwistedWhirl, Whirl, WhirlModel, WhirlScene
-
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-from program import count_equations  # noqa: E402
-
-
-# Appendix C.6.
-M = M_F = K = R_C = J = K_PHI = 1.0
-C, D, B_1, K_B, C_B, MU, R, T_0, DELTA = 0.3, 0.1, 0.1, 50.0, 30.0, 0.5, 2.0, 0.2, 0.3
-M_A, BETA = M + M_F, D / (C + D)
-
-
-def whirl(z, v, theta, f_b):
-    """z'' of the rotor's middle z = x + iy by (A.2), (A.13), and the fluid's force, under the contact force f_b."""
-    drag, stiff = D, B_1 * abs(z) ** 2
-    rest = 1j * M_F * theta * v + M_F * theta**2 / 4 * z - drag * (v - 0.5j * theta * z) - stiff * z
-    a = (-C * v - K * z + rest + f_b) / M_A
-    return a, rest - M_F * a
-
-
-def contact(r, u, v_rel, touch, roll):
-    """F_bN and F_bT, section 3.5 and (A.6)."""
-    normal = (K_B * (r - R_C) + C_B * u) if touch > 0 else 0.0
-    return normal, -MU * roll * normal
-
-
-def drillstring(r, u, Omega, phi, w, omega, s):
-    """(A.51), for values s of the switches."""
-    theta = omega + w
-    normal, along = contact(r, u, r * Omega + theta * R, s[0], s[1])
-    a, fluid = whirl(r, u + 1j * r * Omega, theta, -normal + 1j * along)
-    bit = -T_0 * s[2] / (1 + DELTA * abs(theta))
-    twist = (-K_PHI * phi + bit + along * R - fluid.imag * r) / J
-    return u, a.real + r * Omega**2, (a.imag - 2 * u * Omega) / r, w, twist
 
 
 def numbers(system, y, s, t=0.0):
@@ -170,7 +136,8 @@ def test_a_scene_costs_what_the_same_written_by_hand_costs():
     counts, ends = [], []
     for system, y in zip((scene, hand), starts):
         y = jax.tree.map(jnp.asarray, y)
-        counts.append(count_equations(lambda y, system=system: nsjax.solve(system, 0.0, 20.0, y).y1, y))
+        program = jax.make_jaxpr(lambda y, system=system: nsjax.solve(system, 0.0, 20.0, y).y1)(y)
+        counts.append(len(list(equations_of(program.jaxpr))))
         ends.append(np.array(jax.tree.leaves(nsjax.solve(system, 0.0, 20.0, y).y1)))
     assert counts[0] <= 1.03 * counts[1]
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
@@ -238,9 +205,214 @@ def test_equilibria_of_whirl():
     np.testing.assert_allclose(jax.tree.leaves(f.y), [R_C, 0.0, BETA * OMEGA_F / 2], atol=1e-11)
 
 
+def slope(of, *at):
+    """dr/dω along equilibria, by the implicit function."""
+    with mp.workdps(30):
+        jacobian = mp.matrix(2, 3)
+        for i, j in itertools.product(range(2), range(3)):
+            jacobian[i, j] = mp.diff(lambda *x, i=i: of(*x)[i], tuple(at), tuple(int(k == j) for k in range(3)))
+        return float(-mp.lu_solve(jacobian[:, 1:], jacobian[:, 0])[0])
+
+
 @pytest.mark.slow
 def test_the_whole_branch_of_whirl():
+    """Fig. A.6 from point c on: stable e2, f, unstable e3, d, stable e4; their slopes beside f, (A.47)-(A.49)."""
     system = gallery.thesis("A.7", omega=2.64)
     r = np.sqrt((2.64**2 / 4 * (1 - 2 * BETA + 2 * BETA**2) - K) / B_1)
     branch = nsjax.continue_equilibrium(system, Whirl(r, 0.0, BETA * 1.32), "omega", (OMEGA_C + 1e-3, 3.5))
-    print(branch)
+    (f,) = branch.bifurcations
+    np.testing.assert_allclose(f.value, OMEGA_F, rtol=1e-12)
+    rolling = gallery.thesis("A.7", omega=0.6)
+    branch = nsjax.continue_equilibrium(rolling, Whirl(1.02, 0.0, -R * 0.6 / 1.02), "omega", (0.2, 2.6))
+    (d,) = branch.bifurcations
+    omega_d, r_d = point_d()
+    assert d.discontinuous and d.kind == "saddle-node"
+    np.testing.assert_allclose([d.value, d.y.r, d.y.Omega], [omega_d, r_d, -R * omega_d / r_d], rtol=1e-12)
+    stable = np.asarray(branch.stable)
+    assert stable.any() and not stable.all()
+    # Beside f: e2 without, e3 with contact.
+    no_contact = lambda omega, r, Omega: (radial(omega, r, Omega) / r, (C + D) * Omega - D * omega / 2)  # noqa: E731
+    for of, off in ((no_contact, -1e-8), (slip, 1e-8)):
+        want = slope(of, OMEGA_F, R_C, BETA * OMEGA_F / 2)
+        omega = OMEGA_F + off / want
+        guess = Whirl(R_C + off, 0.0, BETA * OMEGA_F / 2)
+
+        def radius(omega, guess=guess):
+            return nsjax.find_equilibrium(gallery.thesis("A.7", omega=omega), guess).y.r
+
+        np.testing.assert_allclose(jax.jacfwd(radius)(omega), want, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_in_cartesian_coordinates_the_middle_is_an_equilibrium_and_a_whirl_an_orbit():
+    """Point c is a Hopf bifurcation, and from there on e2 is an orbit of period 2π/|Ω|."""
+    scene = gallery.thesis("A.7", omega=2.64, coordinates="cartesian")
+    branch = nsjax.continue_equilibrium(scene, scene.state(), "omega", (0.2, 3.5))
+    (hopf,) = branch.bifurcations
+    assert hopf.kind == "Hopf" and hopf.criticality == "supercritical"
+    np.testing.assert_allclose(hopf.value, OMEGA_C, rtol=1e-12)
+    r, Omega = np.sqrt((2.64**2 / 4 * (1 - 2 * BETA + 2 * BETA**2) - K) / B_1), BETA * 1.32
+    orbit = nsjax.find_orbit(scene, scene.state(dict(x=r), dict(y=r * Omega)), period=2 * np.pi / Omega)
+    np.testing.assert_allclose(orbit.period, 2 * np.pi / Omega, rtol=1e-11)
+    np.testing.assert_allclose(np.hypot(orbit.y0.q.x, orbit.y0.q.y), r, rtol=1e-10)
+
+
+# A.8: stick-slip.
+
+
+def twist(t, y, omega, side):
+    theta = y[1] + omega
+    return y[1], -y[0] - side * T_0 / (1 + DELTA * side * theta)
+
+
+def until_it_stands(y, omega, side):
+    """The time and the twist at which θ' comes back to zero, in slip on one side."""
+
+    def stands(t, y, omega, side):
+        return side * (y[1] + omega)
+
+    stands.terminal, stands.direction = True, -1
+    # On the surface the first step finds that out; it leaves it tangentially where φ is that at which stick ends.
+    arc = solve_ivp(twist, (0, 30), y, "DOP853", events=stands, args=(omega, side), rtol=1e-13, atol=1e-15)
+    return arc.t[-1], arc.y[0, -1]
+
+
+def after_stick(omega):
+    """From where stick ends, φ = -T_0 / k_φ: duration and twist of the slip forwards."""
+    return until_it_stands([-T_0 * (1 - 1e-15), -omega * (1 - 1e-15)], omega, 1)
+
+
+def lap(phi, omega):
+    """From slip backwards that ends at φ to the next that does: time, twist."""
+    t, there = until_it_stands([phi, -omega], omega, 1)
+    back, phi = until_it_stands([there, -omega], omega, -1)
+    return t + back, phi
+
+
+def test_stick_slip_without_stick():
+    """Fig. A.7a: at ω = 2 slip forwards and backwards alone. scipy's orbit by fixed-point iteration."""
+    guess = gallery.entry("A.8").orbit
+    orbit = nsjax.find_orbit(gallery.thesis("A.8"), guess.y0, period=guess.period)
+    phi = -0.25
+    for _ in range(15):  # the multiplier is 0.07
+        period, phi = lap(phi, 2.0)
+    np.testing.assert_allclose(orbit.period, period, rtol=1e-11)
+    assert [e.switch for e in orbit.events] == ["bit", "bit"]
+    np.testing.assert_allclose(orbit.events.y_after.phi[1], phi, rtol=1e-10)
+
+
+BACKWARDS = 0.7422889477650  # where slip backwards appears; as the next test finds it
+
+
+@pytest.mark.parametrize(
+    "omega, low, high", [(0.77, 0.72, 0.78), pytest.param(0.72, 0.71, 0.77, marks=pytest.mark.slow)]
+)
+def test_the_corner_where_slip_backwards_appears(omega, low, high):
+    """Pitfall 25: seen from either side. A segment that returns to its surface vanishes, beside orbits on which it has
+    no duration anyway; and a surface can only just hold what comes onto it. The branch goes on."""
+    corner = brentq(lambda omega: after_stick(omega)[1] - T_0, 0.7, 0.8, xtol=1e-13)
+    assert corner == pytest.approx(BACKWARDS, abs=1e-11)
+    system = gallery.thesis("A.8", omega=omega)
+    orbit = nsjax.find_orbit(system, Twist(-1.0, 0.3), period=6.32)
+    branch = nsjax.continue_orbit(system, orbit, "omega", (low, high))
+    assert branch.ends == (f"omega = {low}", f"omega = {high}")
+    (point,) = branch.special_points
+    assert (point.kind, point.discontinuous, point.count) == ("none", True, ((1,), (1,)))
+    np.testing.assert_allclose(point.value, corner, atol=1e-9)
+    np.testing.assert_allclose(point.period, after_stick(corner)[0] + 2 * T_0 / corner, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_branch_p1():
+    """Fig. A.7b: it does not end; slip backwards appears, and then stick vanishes."""
+
+    def arrives(omega):  # where stick vanishes: slip backwards ends at φ = -T_0
+        t, phi = after_stick(omega)
+        return until_it_stands([phi, -omega], omega, -1)[1] + T_0
+
+    gone = brentq(arrives, 1.5, 2.0, xtol=1e-13)
+    guess = gallery.entry("A.8").orbit
+    system = gallery.thesis("A.8")
+    orbit = nsjax.find_orbit(system, guess.y0, period=guess.period)
+    branch = nsjax.continue_orbit(system, orbit, "omega", (0.05, 3.0))
+    assert branch.ends == ("omega = 0.05", "omega = 3") and branch.stable.all() and not branch.others
+    assert [p.kind for p in branch.special_points] == ["none", "none"]
+    np.testing.assert_allclose([p.value for p in branch.special_points], [BACKWARDS, gone], atol=1e-8)
+    slowest = np.asarray(branch.low.w) + branch.values  # of Fig. A.7b
+    np.testing.assert_allclose(slowest[branch.values < BACKWARDS], 0, atol=1e-9)
+    assert np.all(slowest[branch.values > BACKWARDS + 0.05] < 0)
+
+
+# A.9: both.
+
+
+def motion(t, y, omega, touch):
+    return drillstring(*y, omega, (touch, 1, 1))
+
+
+def flow(y, omega, time):
+    """scipy, with contact as the equations have it; rotor and bit slip forwards."""
+
+    def meets(t, y, *_):
+        return y[0] - R_C
+
+    def leaves(t, y, *_):
+        return K_B * (y[0] - R_C) + C_B * y[2 - 1]
+
+    for event, way in ((meets, 1), (leaves, -1)):
+        event.terminal, event.direction = True, way
+    t, touch = 0.0, 1 if y[0] > R_C and leaves(0, y) > 0 else -1
+    while t < time:
+        event = leaves if touch > 0 else meets
+        arc = solve_ivp(motion, (t, time), y, "DOP853", events=event, args=(omega, touch), rtol=1e-12, atol=1e-13)
+        t, y = arc.t[-1], arc.y[:, -1]
+        touch = -touch if arc.status == 1 else touch
+    return y
+
+
+@pytest.mark.slow
+def test_an_orbit_with_contact():
+    """P4 at ω = 2.5, unstable: contact begins and ends once a lap, and nothing else happens."""
+    guess = TwistedWhirl(1.0197, 0.2029, 0.7161, 1.9272, -0.8771)
+    orbit = nsjax.find_orbit(gallery.thesis("A.9", omega=2.5), guess, period=5.402)
+    assert [e.switch for e in orbit.events] == ["wall", "wall"] and not orbit.stable
+    y, time = np.array(orbit.y0), float(orbit.period)
+    np.testing.assert_allclose(time, 5.402389875780514, rtol=1e-10)
+    np.testing.assert_allclose(flow(y, 2.5, time), y, atol=1e-8)
+    step = 1e-5
+    columns = [(flow(y + step * e, 2.5, time) - flow(y - step * e, 2.5, time)) / (2 * step) for e in np.eye(5)]
+    want = np.linalg.eigvals(np.array(columns).T)
+    order = lambda rho: rho[np.lexsort((rho.imag, -abs(rho).round(4)))]  # noqa: E731
+    np.testing.assert_allclose(order(np.asarray(orbit.multipliers)), order(want), atol=1e-5)
+
+
+def of_e2(omega):
+    """E2 and its eigenvalues, in 30 digits."""
+    r = mp.sqrt((omega**2 / 4 * (1 - 2 * BETA + 2 * BETA**2) - K) / mp.mpf("0.1"))
+    y = [r, mp.mpf(0), BETA * omega / 2, mp.mpf(0), mp.mpf(0)]
+    y[3] = drillstring(*y, omega, (-1, 1, 1))[4] / K
+    jacobian, step = mp.matrix(5, 5), mp.mpf(10) ** -10
+    for j in range(5):
+        ends = [drillstring(*[x + s * step * (i == j) for i, x in enumerate(y)], omega, (-1, 1, 1)) for s in (1, -1)]
+        for i in range(5):
+            jacobian[i, j] = (ends[0][i] - ends[1][i]) / (2 * step)
+    return y, mp.eig(jacobian, right=False)
+
+
+def test_hopf_point_of_e2():
+    """Where E2 loses its stability to torsion."""
+    with mp.workdps(30):
+
+        def leading(omega):
+            return max((x for x in of_e2(omega)[1] if abs(x.imag) > mp.mpf("0.5")), key=lambda x: x.real)
+
+        omega = mp.findroot(lambda omega: leading(omega).real, (2.54, 2.5405), solver="secant")
+        y, _ = of_e2(omega)
+        frequency = abs(leading(omega).imag)
+    np.testing.assert_allclose(float(omega), 2.540313206, atol=1e-9)
+    system = gallery.thesis("A.9", omega=float(omega))
+    found = nsjax.find_equilibrium(system, TwistedWhirl(*map(float, y)))
+    np.testing.assert_allclose(jax.tree.leaves(found.y), np.array(y, float), atol=1e-12)
+    roots = np.asarray(found.eigenvalues)
+    pair = roots[np.argmin(np.abs(roots - 1j * float(frequency)))]
+    assert abs(pair - 1j * float(frequency)) < 1e-10

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from drillstring import drillstring, regions
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -52,6 +53,18 @@ def elastic_support(t, x, v):
 
 def dry_friction(t, x, v):
     return v, 2 * np.cos(0.5 * t) - x - (1 if v > 0 else -1)
+
+
+def whirl_and_twist(t, *y, omega=3.05):  # (A.51)
+    return drillstring(*y, omega, regions(*y, omega))
+
+
+def whirl(t, *y):  # (A.16)
+    return whirl_and_twist(t, *y, 0.0, 0.0, omega=2.6)[:3]
+
+
+def twist(t, phi, w):  # (A.50)
+    return w, -phi - 0.2 * np.sign(w + 2) / (1 + 0.3 * abs(w + 2))
 
 
 def support(t, x, v):  # (3.53), (3.54)
@@ -152,6 +165,9 @@ FIELDS = {
     "6.7": lambda t, x, v: stick_slip(t, x, v, c=0.1),
     "6.8": forced_friction,
     "6.9": forced_stick_slip,
+    "A.7": whirl,
+    "A.8": twist,
+    "A.9": whirl_and_twist,
 }
 
 # The mechanical reading of dry friction: belt velocity, F_ex(t, x) in stick, largest static friction force.
@@ -183,21 +199,23 @@ def test_structure_at_every_value_of_the_switches(key):
 def test_fields_in_each_region(key):
     rng = np.random.default_rng(0)
     dimension = len(gallery.THESIS[key].y0)
-    regions = set()
+    found = set()
     for _ in range(100):
         t, y = rng.uniform(0, 10), rng.uniform(-2, 2, dimension)
         expected = FIELDS[key](t, *y)
         np.testing.assert_allclose(field(key, t, y), expected, rtol=1e-13, atol=1e-13)
         system = gallery.thesis(key)
         h = [min(map(float, k.components(system, t, state(key, *y)))) for k in system.switches]
-        regions.add(tuple(np.sign(h)))
-    # μ has one sign in (5.11), r > -μ/2 in (5.29), and the lines of 5.7 make a grid.
-    assert len(regions) == {"(5.11)": 2, "(5.29)": 2, "5.7": 9}.get(key, len(system.switches) + 1)
+        found.add(tuple(np.sign(h)))
+    # μ has one sign in (5.11), r > -μ/2 in (5.29), and the lines of 5.7 make a grid; rotor and bit turn forwards in A.7
+    # to A.9.
+    some = {"(5.11)": 2, "(5.29)": 2, "5.7": 9, "A.7": 2, "A.8": 1, "A.9": 2}
+    assert len(found) == some.get(key, len(system.switches) + 1)
 
 
 @pytest.mark.parametrize("key", KEYS)
 def test_affine_in_each_switch_value(key):
-    t, y = 0.3, np.array([1.3, 0.7, -0.4])[: len(gallery.THESIS[key].y0)]
+    t, y = 0.3, np.array([1.3, 0.7, -0.4, 0.2, 0.5])[: len(gallery.THESIS[key].y0)]
     n = len(gallery.thesis(key).switches)
     for i in range(n):
         at = [field(key, t, y, [value if j == i else 0.6 for j in range(n)]) for value in (-1.0, 0.5, 1.0)]
@@ -296,7 +314,14 @@ def test_values_of_appendix_c(key):
 @pytest.mark.parametrize("key", KEYS)
 def test_period(key):
     system = gallery.thesis(key)
-    if not hasattr(system, "omega") or key in ("(5.25)", "(5.29)", "(5.30)"):  # there it is not that of a force
+    if not hasattr(system, "omega") or key in (
+        "(5.25)",
+        "(5.29)",
+        "(5.30)",
+        "A.7",
+        "A.8",
+        "A.9",
+    ):  # there it is not that of a force
         assert system.period is None
         return
     np.testing.assert_allclose(system.period, 2 * np.pi / system.omega)
@@ -520,6 +545,10 @@ def test_period_of_3_4():
         ("(5.31)", "(5.30)"),
         ("5.8", "(5.8)"),
         ("Fig. 5.3", "figure 5.3"),
+        ("a.7", "A.7"),
+        ("Section A.8", "A.8"),
+        ("eq. A.51", "A.9"),
+        ("(A.15)", "A.7"),
     ],
 )
 def test_spellings(spelling, key):
@@ -527,10 +556,10 @@ def test_spellings(spelling, key):
 
 
 @pytest.mark.parametrize(
-    "key", ["2.1", "2.1e", "(2.4)", "section 2.3", "example 2.6", "1.1", "1.1(4)", "5.3", "(5.2)", "6.66", ""]
+    "key", ["2.1", "2.1e", "(2.4)", "section 2.3", "example 2.6", "1.1", "1.1(4)", "5.3", "(5.2)", "6.66", "A.1", ""]
 )
 def test_unknown_key(key):
-    with pytest.raises(ValueError, match="Argument `key` must be one of '1.1\\(1\\)'.*'6.9', but got") as error:
+    with pytest.raises(ValueError, match="Argument `key` must be one of '1.1\\(1\\)'.*'A.9', but got") as error:
         gallery.thesis(key)
     assert "\n" not in str(error.value)
 
@@ -544,7 +573,7 @@ def test_parameters():
 
 
 def test_entries_are_frozen_and_ordered():
-    assert KEYS[0] == "1.1(1)" and KEYS[-1] == "6.9" and len(KEYS) == 35
+    assert KEYS[0] == "1.1(1)" and KEYS[-1] == "A.9" and len(KEYS) == 38
     with pytest.raises(TypeError):
         gallery.THESIS["6.6"] = None
     with pytest.raises(AttributeError):
