@@ -322,6 +322,7 @@ class Imperfect(nsjax.System):
         return 2 * jnp.pi
 
 
+@pytest.mark.slow  # (branch points of branches are in test_continue_orbit)
 def test_a_single_branch_point():
     """It lies on a curve over a parameter that leaves the symmetry, and on none over one that breaks it: over both the
     orbits are a smooth surface."""

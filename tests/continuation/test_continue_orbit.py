@@ -76,6 +76,7 @@ def test_infinitely_unstable_orbits(stick_slip):
     np.testing.assert_allclose(stick_slip.periods[i], orbit.period, atol=1e-8)
 
 
+@pytest.mark.slow  # (a notebook runs 6.8)
 def test_symmetry_breaking(friction):
     """Section 6.8: A smooth, B discontinuous, C a sliding-mode transition that is no bifurcation."""
     a, b, c = (the(friction, POINTS[f"6.8 {name}"].at) for name in "ABC")
@@ -238,6 +239,7 @@ def test_grazing_impact():
     assert {int(b.orders[0]) for b in branch.branches} == {1, 2}
 
 
+@pytest.mark.slow  # (by default that of the drillstring, where slip backwards appears)
 def test_autonomous_corner():
     """The limit cycle comes to touch the tip of a surface: what damps there only delays it, and nothing jumps."""
     system = VanDerPol()

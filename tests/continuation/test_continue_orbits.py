@@ -87,6 +87,7 @@ def test_closed_forms(walls):
     np.testing.assert_allclose(branches.ys.x[real], (amplitude * np.cos(omega * branches.ts - phase))[real], atol=1e-10)
 
 
+@pytest.mark.slow  # (by default folds are passed one branch after the other, test_continue_orbit)
 def test_folds_are_passed(duffing):
     """As one branch after the other has them."""
     orbits, branches = duffing

@@ -144,7 +144,9 @@ def test_solution_over_several_periods(classic):
 @pytest.mark.parametrize(
     "parameters, y0, period, result",
     [
-        (dict(c=0.1), (1.0, 1e-3), 6.3, RESULTS.orbit_is_equilibrium),  # a focus at x = F_slip / k
+        pytest.param(  # a focus at x = F_slip / k
+            dict(c=0.1), (1.0, 1e-3), 6.3, RESULTS.orbit_is_equilibrium, marks=pytest.mark.slow
+        ),
         (dict(c=0.1), (2.0, 0.0), 2 * 12.6352, RESULTS.orbit_is_multiple_cover),
         (dict(), (2.02, 0.0), 3 * 13.536, RESULTS.orbit_is_multiple_cover),
         (dict(c=0.1, v_dr=2.0), (2.0, 0.0), 12.6, RESULTS.orbit_is_equilibrium),  # beyond the fold of Fig. 6.15
