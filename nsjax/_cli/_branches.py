@@ -98,6 +98,8 @@ DIAGRAMS = {
         view=(-4.0, 4.0),
         enlarged=((1.65, 1.73), (2.0, 2.3)),
     ),
+    "A.8": Diagram("omega", (0.05, 3.0)),  # p1
+    "A.9": Diagram("omega", (2.3, 3.6)),  # P4, and P3, P2 that it goes over into
 }
 
 
