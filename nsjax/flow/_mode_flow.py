@@ -4,12 +4,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-from jaxtyping import Array
 
 from .._types import Scalar, Y
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
-from ..system._parameter import Path
 from ..system._system import System
 
 
@@ -25,20 +23,28 @@ class ModeFlow(System):
 
 class VariedModeFlow(ModeFlow):
     """A state with perturbations of it, Φ' = (∂f/∂y) Φ (3.5), which are columns of the structure of the state, with one
-    leading axis. Some of them may be due to a parameter (or to several): `moved` is its change in each."""
+    leading axis. Some of them may be due to changes of the model: `moved` are those of its arrays, in each column, of
+    the structure of the model with None for every array that stays as it is."""
 
-    path: Path = eqx.field(static=True, default=())
-    value: Array | None = None
-    moved: Array | None = None
+    moved: Any = None
 
     def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
         y, columns = y
+        moved = jax.tree.map(lambda _: None, self.model) if self.moved is None else self.moved
+        changed, still = eqx.partition(self.model, jax.tree.map(_is_array, moved, is_leaf=_is_none))
 
-        def rhs(y: Y, value: Array | None) -> Y:
-            model = self.model if value is None else self.model.with_parameter(self.path, value)
-            return model.flow(t, y, self.state)
+        def rhs(y: Y, changed: Any) -> Y:
+            return eqx.combine(changed, still).flow(t, y, self.state)
 
-        def change(dy: Y, dv: Array | None) -> Y:
-            return jax.jvp(rhs, (y, self.value), (dy, dv))[1]
+        def change(dy: Y, moved: Any) -> Y:
+            return jax.jvp(rhs, (y, changed), (dy, moved))[1]
 
-        return rhs(y, self.value), jax.vmap(change)(columns, self.moved)
+        return rhs(y, changed), jax.vmap(change)(columns, moved)
+
+
+def _is_none(x: Any) -> bool:
+    return x is None
+
+
+def _is_array(x: Any) -> bool:
+    return x is not None

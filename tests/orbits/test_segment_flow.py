@@ -1,10 +1,13 @@
 """The flow of one mode: by the matrix exponential and by steps, with its derivatives."""
 
+import dataclasses
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxprs_in_params
 from models import Motion, pid
 
 import nsjax
@@ -12,6 +15,7 @@ from nsjax import continue_orbit, find_orbit, gallery
 from nsjax.flow._integrator import Integrator
 from nsjax.orbits.segments._equations import OrbitCurve
 from nsjax.orbits.segments._segment_flow import ALWAYS, exactness, FREE_MODES, NEVER, SegmentFlow
+from nsjax.system._mode import ModeState
 from nsjax.system._model import SwitchedSystem
 from nsjax.system._system import arrays_of
 
@@ -35,10 +39,14 @@ class Driven(nsjax.System):
         return 2 * jnp.pi / self.omega
 
 
-def flow_of(system, exact, name="omega", slides=True):
+def flow_of(system, exact, slides=True):
     system = arrays_of(system, jnp.float64)
     model = SwitchedSystem.forwards(system, jnp.zeros(()), Y)
-    return SegmentFlow(model, (name,), Y, HOW, exact, slides)
+    return SegmentFlow(model, Y, HOW, exact, slides)
+
+
+def at(flow, omega):
+    return dataclasses.replace(flow, model=flow.model.with_parameter(("omega",), omega))
 
 
 def test_which_modes():
@@ -66,10 +74,10 @@ def test_both_ways(mode, ends):
         where = state(curve, jnp.asarray([mode], jnp.int32), jnp.asarray([0], jnp.int32))
 
         def end(a, b, x, value, flow=flow, where=where):
-            return flow.arrive(a, b, x, value, where)
+            return at(flow, value).arrive(a, b, x, where)
 
         jacobians = jax.jacfwd(end, argnums=(0, 1, 2, 3))(a, b, x, value)
-        results.append((end(a, b, x, value), jacobians, flow.along(a, b, x, value, where)))
+        results.append((end(a, b, x, value), jacobians, at(flow, value).along(a, b, x, where)))
     (exact, by, (ts, xs, sums)), (stepped, want, (ts_2, xs_2, sums_2)) = results
     np.testing.assert_allclose(exact, stepped, atol=1e-11)
     for found, other in zip(by, want):
@@ -86,9 +94,7 @@ def test_forcing_that_cancels(a):
     flow = flow_of(gallery.ForcedFriction(omega=0.8, f_0=250.0), True)
     where = OrbitCurve.state(_Curve(flow.model), jnp.asarray([0], jnp.int32), jnp.asarray([0], jnp.int32))
     x = jnp.array([0.02, 0.0])
-    np.testing.assert_allclose(
-        flow.arrive(jnp.asarray(a), jnp.asarray(a + 0.7), x, jnp.asarray(0.8), where), x, atol=1e-14
-    )
+    np.testing.assert_allclose(flow.arrive(jnp.asarray(a), jnp.asarray(a + 0.7), x, where), x, atol=1e-14)
 
 
 class _Curve:
@@ -102,10 +108,69 @@ def test_samples():
     """Between the ends too they are those of the exponential: each is the end of a shorter flow."""
     flow = flow_of(gallery.Trilinear(omega=1.2), True, slides=False)
     where = OrbitCurve.state(_Curve(flow.model), jnp.asarray([-1, 1], jnp.int32), jnp.asarray([0, 0], jnp.int32))
-    a, x, value = jnp.asarray(0.1), jnp.array([-1.1, 0.2]), jnp.asarray(1.2)
-    ts, xs, _ = flow.along(a, jnp.asarray(1.3), x, value, where)
+    a, x = jnp.asarray(0.1), jnp.array([-1.1, 0.2])
+    ts, xs, _ = flow.along(a, jnp.asarray(1.3), x, where)
     for i in (0, 1, 7, 31, 64):
-        np.testing.assert_allclose(flow.arrive(a, ts[i], x, value, where), xs[i], atol=1e-12)
+        np.testing.assert_allclose(flow.arrive(a, ts[i], x, where), xs[i], atol=1e-12)
+
+
+class Decay(nsjax.System):
+    """y' = -k y + c, both of which are arrays of the model."""
+
+    k: jax.Array | float = 0.7
+    c: jax.Array | float = 0.4
+
+    def vector_field(self, t, y, s):
+        return -self.k * y + self.c * jnp.ones_like(y)
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_tangents_of_the_model(exact):
+    """The derivative by a parameter is a tangent of the model, and no column is carried for what has none."""
+    y, t = jnp.array([1.3]), jnp.asarray(2.0)
+    model = SwitchedSystem.forwards(arrays_of(Decay(), jnp.float64), t, y)
+
+    def end(p, x=y):
+        flow = SegmentFlow(model.with_parameter((("k",), ("c",)), p), y, HOW, exact, False)
+        return flow.arrive(jnp.zeros(()), t, x, ModeState((), (), ()))[0]
+
+    def closed(p):
+        return y[0] * jnp.exp(-p[0] * t) + p[1] / p[0] * (1 - jnp.exp(-p[0] * t))
+
+    p = jnp.array([0.7, 0.4])
+    np.testing.assert_allclose(end(p), closed(p), atol=1e-11)
+    np.testing.assert_allclose(jax.jacfwd(end)(p), jax.jacfwd(closed)(p), atol=1e-10)
+    np.testing.assert_allclose(jax.hessian(closed)(p), jax.jacfwd(jax.jacfwd(end))(p), atol=1e-8)
+    step = 1e-5 * np.eye(2)
+    differences = [(end(p + h) - end(p - h)) / 2e-5 for h in step]
+    np.testing.assert_allclose(jax.jacfwd(end)(p), differences, atol=1e-8)
+
+    if not exact:
+        assert _columns(end, p) == 3
+        assert _columns(lambda x: end(p, x), y) == 1
+        one = model.with_parameter(("k",), p[0])
+
+        def by_c(c):
+            flow = SegmentFlow(one.with_parameter(("c",), c), y, HOW, exact, False)
+            return flow.arrive(jnp.zeros(()), t, y, ModeState((), (), ()))
+
+        assert _columns(by_c, p[1]) == 2
+
+
+def _columns(fn, x):
+    """How many columns the variational equation of a derivative carries."""
+    jaxpr = jax.make_jaxpr(lambda x: jax.jvp(fn, (x,), (jnp.ones_like(x),)))(x)
+    return max(_widths(jaxpr.jaxpr))
+
+
+def _widths(jaxpr):
+    found = set()
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name == "while":
+            found |= {v.aval.shape[0] for v in eqn.outvars if v.aval.ndim == 2 and v.aval.shape[1] == 1}
+        for inner in jaxprs_in_params(eqn.params):
+            found |= _widths(inner)
+    return found
 
 
 @pytest.mark.slow

@@ -80,11 +80,11 @@ def order_of(system: System, orbit: Orbit) -> Int[np.ndarray, ""]:
 
 
 def _segments(curve: OrbitCurve, start: Start, value: float) -> tuple[SegmentFlow, list[tuple]]:
-    """The flow of the segments, and for each what there is to say of it: times, first state, parameter and mode."""
+    """The flow of the segments, and for each what there is to say of it: times, first state and mode."""
     itinerary = start.itinerary
     states = [curve.state(itinerary.mode[i], itinerary.part[i]) for i in itinerary.rows]
     rows = zip(start.begin, start.end, start.x, states)
-    return curve.on(itinerary).flow, [(a, b, x, np.asarray(value), state) for a, b, x, state in rows]
+    return curve.on(itinerary).flow(curve.model_at(np.asarray(value))), list(rows)
 
 
 def _exact(curve: OrbitCurve, start: Start, value: float) -> int:

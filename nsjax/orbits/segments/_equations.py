@@ -57,10 +57,14 @@ class OrbitCurve(eqx.Module):
         slides = self.model.holds(*np.asarray(itinerary.mode)[: int(itinerary.num)])
         return self if slides == self.slides else dataclasses.replace(self, slides=slides)
 
-    @property
-    def flow(self) -> SegmentFlow:
+    def model_at(self, value: Array) -> SwitchedSystem:
+        """The model with a value of the parameter (or of several)."""
+        return self.model.with_parameter(self.path, value)
+
+    def flow(self, model: SwitchedSystem) -> SegmentFlow:
+        """That of the modes of `model_at` some value."""
         exact = self.exact == ALWAYS or (self.exact == FREE_MODES and not self.slides)
-        return SegmentFlow(self.model, self.path, self.like, self.integrator, exact, self.slides)
+        return SegmentFlow(model, self.like, self.integrator, exact, self.slides)
 
     @property
     def autonomous(self) -> bool:
@@ -119,14 +123,15 @@ class OrbitCurve(eqx.Module):
         last segment ends, and the states at the ends."""
         begin, end, x, value = self.parts(u)
         rows = len(begin)
-        model = self.model.with_parameter(self.path, value)
+        model = self.model_at(value)
+        flow = self.flow(model)
         index = jnp.arange(rows, dtype=itinerary.num.dtype)
         happened, final = index < itinerary.num, index == itinerary.num - 1
         mode, part = jnp.asarray(itinerary.mode), jnp.asarray(itinerary.part)
         following = jnp.where(final[:, None], mode[:1], jnp.roll(mode, -1, axis=0))
 
         def row(a: Scalar, b: Scalar, x: Array, mode: Array, part: Array) -> Array:
-            return self.flow.arrive(a, b, x, value, self.state(mode, part))
+            return flow.arrive(a, b, x, self.state(mode, part))
 
         last = jax.vmap(row)(begin, end, x, mode, part)
 
@@ -209,7 +214,7 @@ def row_sizes(df: Array) -> Array:
 @interactive
 def field_at(curve: OrbitCurve, value: Array, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
     """The field in a mode."""
-    model = curve.model.with_parameter(curve.path, value)
+    model = curve.model_at(value)
     return jfu.ravel_pytree(model.flow(t, curve.unravel(x), curve.state(mode, part)))[0]
 
 
@@ -218,7 +223,7 @@ def guards_along(
     curve: OrbitCurve, value: Array, t: Scalar, x: Array, mode: Array, part: Array
 ) -> tuple[Array, Array, Array]:
     """All guards in a mode, `[slot, part]`, and their first and second derivatives along the flow."""
-    model, state = curve.model.with_parameter(curve.path, value), curve.state(mode, part)
+    model, state = curve.model_at(value), curve.state(mode, part)
 
     def along(t: Scalar, x: Array) -> tuple[Array, Array]:
         f = jfu.ravel_pytree(model.flow(t, curve.unravel(x), state))[0]

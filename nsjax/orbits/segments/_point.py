@@ -82,8 +82,8 @@ def state_at(curve: OrbitCurve, itinerary: OrbitItinerary, look: PointData, i: i
     """The state at a time in segment i. (Between steps the states of a `PointData` are those of the solver's dense
     output, less exact than the steps.)"""
     state = curve.state(itinerary.mode[i], itinerary.part[i])
-    flow = curve.on(itinerary).flow
-    return np.asarray(states_along(flow, look.begin[i], np.asarray(t), look.x[i], look.parameter, state))[-1]
+    flow = curve.on(itinerary).flow(curve.model_at(look.parameter))
+    return np.asarray(states_along(flow, look.begin[i], np.asarray(t), look.x[i], state))[-1]
 
 
 class Plane(NamedTuple):
@@ -181,7 +181,7 @@ def _seen(
     """All that is seen of a point."""
     begin, end, x, value = curve.parts(u)
     n, rows, m = len(curve.sizes), len(begin), curve.dimension
-    model = curve.model.with_parameter(curve.path, value)
+    model = curve.model_at(value)
     border, (f, last, df, closing) = plane.normal, linear
     scaled = df / row_sizes(df)[:, None]
     whole = jnp.concatenate([scaled, jnp.atleast_2d(border)])
@@ -232,7 +232,7 @@ def _factors(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, df: Array, 
     the last segment ends."""
     begin, _, x, value = curve.parts(u)
     n, rows, m = len(curve.sizes), len(begin), curve.dimension
-    model = curve.model.with_parameter(curve.path, value)
+    model = curve.model_at(value)
     index = jnp.arange(rows, dtype=itinerary.num.dtype)
     after = jnp.where(index >= itinerary.num - 1, 0, index + 1)
     mode, part = jnp.asarray(itinerary.mode), jnp.asarray(itinerary.part)
@@ -305,7 +305,8 @@ def _along(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, turns: bool, 
 def along_segment(curve: OrbitCurve, value: Array, segment: tuple, orders: Array, turns: bool) -> Minima:
     """As `_along`, of one segment (its two times, its first state, mode and parts), with any orders of the zeros."""
     a, b, x, mode, part = segment
-    model = curve.model.with_parameter(curve.path, value)
+    model = curve.model_at(value)
+    flow = curve.flow(model)
     n, state = len(curve.sizes), curve.state(mode, part)
     slots = orders.shape[1] - 2 * n
     slack = jnp.concatenate(
@@ -314,7 +315,7 @@ def along_segment(curve: OrbitCurve, value: Array, segment: tuple, orders: Array
 
     def sample(first: Scalar, last: Scalar, x: Array) -> tuple[Array, Array, Array]:
         end = jnp.where(last < 1, a + (b - a) * last, b)
-        return curve.flow.along(a + (b - a) * first, end, x, value, state)
+        return flow.along(a + (b - a) * first, end, x, state)
 
     def rows(t: Scalar, x: Array) -> list[list[Array]]:
         guards = curve.guard_rows(model, t, x, state) if slots else []

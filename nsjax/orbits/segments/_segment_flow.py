@@ -1,9 +1,10 @@
 """The flow of one mode from one time to another, with its derivatives: what segments of an orbit are made of.
 
 Where the field of the mode is affine in the state it is the matrix exponential, else steps of the solver; derivatives
-by the state and by the parameter are those of the variational equation, by the times exact.
+by the state and by the arrays of the model are those of the variational equation, by the times exact.
 """
 
+import dataclasses
 from typing import Any
 
 import diffrax as dfx
@@ -25,17 +26,15 @@ from ...flow._solve import integrate
 from ...flow.steppers._exponential import affine_parts, expm, generator
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
-from ...system._parameter import Path
 
 
 NEVER, FREE_MODES, ALWAYS = range(3)  # when a mode's flow is known by its exponential
 
 
 class SegmentFlow(eqx.Module):
-    """The flow of each mode of a model, for any value of a parameter (or of several)."""
+    """The flow of each mode of a model. A derivative by a parameter is one by the model, whose arrays have tangents."""
 
     model: SwitchedSystem
-    path: Path = eqx.field(static=True)
     like: Y
     integrator: Integrator = eqx.field(static=True)
     exact: bool = eqx.field(static=True)
@@ -44,30 +43,29 @@ class SegmentFlow(eqx.Module):
     def unravel(self, x: Array) -> Y:
         return jfu.ravel_pytree(self.like)[1](x)
 
-    def field(self, t: Scalar, x: Array, value: Array, state: ModeState) -> Array:
-        model = self.model.with_parameter(self.path, value)
+    def field(self, t: Scalar, x: Array, state: ModeState) -> Array:
+        model = self.model
         if self.exact and not self.slides:
             model = model.within(state.mode)
             return jfu.ravel_pytree(model.field(t, self.unravel(x), model.signs(t, state)))[0]
         return jfu.ravel_pytree(model.flow(t, self.unravel(x), state))[0]
 
-    def generator(self, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> tuple:
+    def generator(self, a: Scalar, b: Scalar, x: Array, state: ModeState) -> tuple:
         """Of the exact flow from time a to b, see `generator`."""
-        model = self.model.with_parameter(self.path, value)
-        force = model.force(a, self.unravel(x), state) if self.slides else None
-        f = self.field(a, x, value, state)
-        return generator(lambda t, x: self.field(t, x, value, state), a, x, f, b - a, force)
+        force = self.model.force(a, self.unravel(x), state) if self.slides else None
+        f = self.field(a, x, state)
+        return generator(lambda t, x: self.field(t, x, state), a, x, f, b - a, force)
 
-    def arrive(self, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> Array:
+    def arrive(self, a: Scalar, b: Scalar, x: Array, state: ModeState) -> Array:
         """The state at time b of the flow from `x` at time a."""
-        return _arrive(self, a, b, x, value, state)
+        return _arrive(self, a, b, x, state)
 
-    def along(self, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> tuple[Array, Array, Array]:
+    def along(self, a: Scalar, b: Scalar, x: Array, state: ModeState) -> tuple[Array, Array, Array]:
         """Times and states at the nodes `THETA` of the way (between steps they are those of the solver's dense output,
         less exact than the steps); and the integrals of the state and of its square."""
         a, b, ts = times_between(a, b, THETA)
         if self.exact:
-            xs = _samples(self, a, b, x, value, state)
+            xs = _samples(self, a, b, x, state)
             weights = jnp.asarray(WEIGHTS, x.dtype)[:, None] * (b - a)
             return ts, xs, jnp.stack([jnp.sum(weights * xs, axis=0), jnp.sum(weights * xs**2, axis=0)])
         span = jnp.abs(b - a)
@@ -75,7 +73,7 @@ class SegmentFlow(eqx.Module):
         far = jnp.where(span > 0, b, jnp.nextafter(a, jnp.inf))
         none = jax.tree.map(jnp.zeros_like, self.like)
         saveat = dfx.SaveAt(subs=dfx.SubSaveAt(ts=jnp.where(span > 0, ts, a), fn=lambda t, y, args: y[0]))
-        summed = _Summed(self.model.with_parameter(self.path, value), state)
+        summed = _Summed(self.model, state)
         sol = integrate(summed, a, far, (self.unravel(x), none, none), self.integrator, saveat=saveat)
         xs = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys)
         sums = jnp.stack([jfu.ravel_pytree(part)[0] for part in sol.y1[1:]])
@@ -93,20 +91,20 @@ def exactness(model: SwitchedSystem, t: Scalar, y: Y) -> int:
 
 
 @interactive
-def fits(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> Array:
+def fits(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeState) -> Array:
     """Whether the forcing along a segment is of a kind that the exponential knows: at several times, as at one where
     its odd derivatives vanish two frequencies look like one."""
 
     def at(t: Scalar) -> Array:
-        return flow.generator(t, t + (b - a), x, value, state)[2]
+        return flow.generator(t, t + (b - a), x, state)[2]
 
     return jnp.all(jax.vmap(at)(a + (b - a) * jnp.asarray([0.0, 0.2764, 0.6180], x.dtype)))
 
 
 @interactive
-def states_along(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState) -> Array:
+def states_along(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeState) -> Array:
     """States along a segment, see `SegmentFlow.along`."""
-    return flow.along(a, b, x, value, state)[1]
+    return flow.along(a, b, x, state)[1]
 
 
 class _Summed(ModeFlow):
@@ -118,20 +116,18 @@ class _Summed(ModeFlow):
 
 
 def _exponential(
-    flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState
+    flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeState
 ) -> tuple[Array, Float[Array, "n n"]]:
     """The state at the end, and its derivative by that at the beginning."""
-    m, scale, good = flow.generator(a, b, x, value, state)
+    m, scale, good = flow.generator(a, b, x, state)
     n, e = len(x), expm(m)
     return jnp.where(good, x + scale * e[:n, n], jnp.nan), e[:n, :n]
 
 
-def _samples(
-    flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState
-) -> Float[Array, "nodes n"]:
+def _samples(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeState) -> Float[Array, "nodes n"]:
     """States at the nodes: from those at equal distances, with three derivatives, by Hermite's polynomials of degree
     seven, which miss a 10321920th of the eighth power of the phase between two of them."""
-    m, scale, good = flow.generator(a, b, x, value, state)
+    m, scale, good = flow.generator(a, b, x, state)
     n, step = len(x), expm(m / NODES)
     z = jnp.zeros((len(m), 1), x.dtype).at[n, 0].set(1)
     while z.shape[1] < NODES:
@@ -159,10 +155,10 @@ def _hermite(s: np.ndarray) -> np.ndarray:
 
 
 @eqx.filter_custom_jvp
-def _arrive(flow: SegmentFlow, a: Any, b: Any, x: Any, value: Any, state: Any) -> Array:
+def _arrive(flow: SegmentFlow, a: Any, b: Any, x: Any, state: Any) -> Array:
     if flow.exact:
-        return _exponential(flow, a, b, x, value, state)[0]
-    smooth = ModeFlow(flow.model.with_parameter(flow.path, value), state)
+        return _exponential(flow, a, b, x, state)[0]
+    smooth = ModeFlow(flow.model, state)
     sol = integrate(smooth, a, b, flow.unravel(x), flow.integrator)
     return jnp.where(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0], jnp.nan)
 
@@ -170,38 +166,47 @@ def _arrive(flow: SegmentFlow, a: Any, b: Any, x: Any, value: Any, state: Any) -
 @_arrive.def_jvp
 def _arrive_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     """By the variational equation; by the times exactly, as the flow knows no beginning."""
-    flow, a, b, x, value, state = primals
-    _, da, db, dx, dvalue, _ = tangents
-    end, by_x, by_value = _varied(flow, a, b, x, value, state)
+    flow, a, b, x, state = primals
+    dflow, da, db, dx, _ = tangents
+    # None where an array is not perturbed: it has no columns in the variational equation. (`like` is structure only.)
+    dmodel = jax.tree.leaves(dflow.model)
+    end, by_x, by_model = _varied(flow, dflow.model, a, b, x, state)
     out = jnp.zeros_like(x)
     if db is not None:
-        out = out + flow.field(b, end, value, state) * db
+        out = out + flow.field(b, end, state) * db
     if dx is not None:
         out = out + by_x @ dx
     if da is not None:
-        out = out - by_x @ flow.field(a, x, value, state) * da
-    if dvalue is not None:
-        out = out + by_value @ jnp.ravel(dvalue)
+        out = out - by_x @ flow.field(a, x, state) * da
+    if dmodel:
+        out = out + by_model @ jnp.concatenate([jnp.ravel(d).astype(x.dtype) for d in dmodel])
     return end, out
 
 
 def _varied(
-    flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, value: Array, state: ModeState
-) -> tuple[Array, Float[Array, "n n"], Float[Array, "n parameters"]]:
-    """The state at the end, and its derivatives by that at the beginning, and by the parameter."""
-    n = len(x)
+    flow: SegmentFlow, perturbed: Any, a: Scalar, b: Scalar, x: Array, state: ModeState
+) -> tuple[Array, Float[Array, "n n"], Float[Array, "n arrays"]]:
+    """The state at the end, and its derivatives by that at the beginning, and by the numbers in those arrays of the
+    model that are `perturbed`."""
+    mask = jax.tree.map(lambda d: d is not None, perturbed, is_leaf=lambda d: d is None)
+    changed, still = eqx.partition(flow.model, mask)
+    values, unravel = jfu.ravel_pytree(changed)
+    n, m = len(x), values.size
     if flow.exact:
 
-        def end(value: Array) -> tuple[Array, tuple[Array, Array]]:
-            end, by_x = _exponential(flow, a, b, x, value, state)
+        def end(values: Array) -> tuple[Array, tuple[Array, Array]]:
+            moved = dataclasses.replace(flow, model=eqx.combine(unravel(values), still))
+            end, by_x = _exponential(moved, a, b, x, state)
             return end, (end, by_x)
 
-        by_value, (out, by_x) = jax.jacfwd(end, has_aux=True)(value)
-        return out, by_x, by_value.reshape(n, -1)
-    eye = jnp.eye(n + value.size, dtype=x.dtype)
-    varied = VariedModeFlow(flow.model, state, flow.path, value, eye[:, n:].reshape(-1, *value.shape))
+        if not m:
+            return *_exponential(flow, a, b, x, state), jnp.zeros((n, 0), x.dtype)
+        by_model, (out, by_x) = jax.jacfwd(end, has_aux=True)(values)
+        return out, by_x, by_model
+    eye = jnp.eye(n + m, dtype=x.dtype)
+    moved = jax.vmap(unravel)(eye[:, n:].astype(values.dtype)) if m else None
     columns = jax.vmap(flow.unravel)(eye[:, :n])
-    sol = integrate(varied, a, b, (flow.unravel(x), columns), flow.integrator)
+    sol = integrate(VariedModeFlow(flow.model, state, moved), a, b, (flow.unravel(x), columns), flow.integrator)
     y, along = sol.y1
     out = jnp.where(is_okay(sol.result), jfu.ravel_pytree(y)[0], jnp.nan)
     phi = jax.vmap(lambda c: jfu.ravel_pytree(c)[0], out_axes=1)(along)
