@@ -132,7 +132,7 @@ class Search(NamedTuple):
             return shooting.orbit(system, t0, y0, period, mode, self.concrete)
         cuts, closes = cuts_near(frozen(system), t0, lax.stop_gradient(y0), period, order, mode, integrator)
         if self.concrete:  # without the rows that are only there to fill up
-            cuts = cuts.first(int(cuts.num) + 1)
+            cuts = cuts.first(int(cuts.itinerary.num))
         orbit = by_segments(system, cuts, t0, order, pieces, integrator, self.newton)
         result = RESULTS.where(closes, orbit.result, RESULTS.orbit_not_found)
         return eqx.tree_at(lambda o: o.result, orbit, result)

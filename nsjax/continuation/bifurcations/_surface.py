@@ -12,9 +12,11 @@ from jaxtyping import Array
 
 from ..._numerics._compile import interactive
 from ...derivatives._floquet import trivial
+from ...orbits.segments._corrector import Plane
 from ...orbits.segments._equations import linearised, OrbitCurve
+from ...orbits.segments._guard_minima import along_segment, zeros_at_begin
 from ...orbits.segments._itinerary import capacity_for, EVENT, GRAZING, OrbitItinerary, Start
-from ...orbits.segments._point import along_segment, correct, Plane, PointData, zeros_at_begin
+from ...orbits.segments._point import correct, PointData
 from ...system._parameter import get_parameter
 from ..orbits._bifurcation import Origin
 from ..orbits._test_functions import branch_value, CIRCLE, CORNERS, Test

@@ -7,9 +7,10 @@ import equinox as eqx
 import numpy as np
 
 from ...maps._corner_normal_form import Cycle
+from ...orbits.segments._corrector import Plane
 from ...orbits.segments._equations import linearised, OrbitCurve
 from ...orbits.segments._itinerary import capacity_for, OrbitItinerary, Start, TIME
-from ...orbits.segments._point import correct, Plane, state_at
+from ...orbits.segments._point import correct, state_at
 from ...system._mode import mode_words
 from ._bifurcation import OrbitBifurcation, OrbitHalfBranch
 from ._test_functions import CORNERS

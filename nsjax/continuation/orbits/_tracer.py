@@ -8,9 +8,10 @@ import jax
 import numpy as np
 
 from ..._numerics._bracket import bracketed
+from ...orbits.segments._corrector import Plane
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import EVENT, OrbitItinerary
-from ...orbits.segments._point import correct, Plane, PointData, state_at
+from ...orbits.segments._point import correct, PointData, state_at
 from .._step_length import FIRST, next_length, shortened, turn_between, TURNED
 from .._zeros import interpolated
 from ._test_functions import (

@@ -10,7 +10,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
-import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -23,7 +22,7 @@ from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ...system._parameter import Path
 from ._guess import landing
-from ._itinerary import EVENT, GRAZING, OrbitItinerary, REPELLING_EXIT, Start, TIME
+from ._itinerary import EVENT, GRAZING, OrbitItinerary, PIECE, REPELLING_EXIT, Start, TIME
 from ._segment_flow import ALWAYS, FREE_MODES, SegmentFlow
 
 
@@ -34,7 +33,10 @@ class OrbitCurve(eqx.Module):
     """The equations; what is unknown is measured in `sizes` (state), `time`, and `width`, the interval of the parameter
     from `low` on.
 
-    With several parameters (`path` holds their paths, and `low` and `width` are vectors) their orbits are a surface.
+    With several parameters (`path` holds their paths, and `low` and `width` are vectors) their orbits are a surface;
+    with none (all three are empty) an orbit is a point.
+
+    `pieces`: into how many of equal length each segment is divided, for multiple shooting. Each has a row of its own.
     """
 
     model: SwitchedSystem
@@ -51,6 +53,7 @@ class OrbitCurve(eqx.Module):
     integrator: Integrator = eqx.field(static=True)
     exact: int = eqx.field(static=True)  # which flows are known by their exponentials
     slides: bool = eqx.field(static=True, default=True)  # whether surfaces hold segments of the itinerary
+    pieces: int = eqx.field(static=True, default=1)
 
     def on(self, itinerary: OrbitItinerary) -> "OrbitCurve":
         """With flows as the modes of an itinerary allow."""
@@ -59,7 +62,7 @@ class OrbitCurve(eqx.Module):
 
     def model_at(self, value: Array) -> SwitchedSystem:
         """The model with a value of the parameter (or of several)."""
-        return self.model.with_parameter(self.path, value)
+        return self.model.with_parameter(self.path, value) if self.path else self.model
 
     def flow(self, model: SwitchedSystem) -> SegmentFlow:
         """That of the modes of `model_at` some value."""
@@ -80,10 +83,19 @@ class OrbitCurve(eqx.Module):
 
     def parts(self, u: Array) -> tuple[Array, Array, Array, Array]:
         """Times of beginning and end, states at the beginnings, parameter."""
-        n, m = len(self.sizes), self.dimension
-        z = u[:-m].reshape(-1, n + 2)
-        value = self.low + u[-m:].reshape(jnp.shape(self.low)) * self.width
+        n, known = len(self.sizes), len(u) - self.dimension
+        z = u[:known].reshape(-1, n + 2)
+        value = self.low + u[known:].reshape(jnp.shape(self.low)) * self.width
         return z[:, 0] * self.time, z[:, 1] * self.time, z[:, 2:] * self.sizes, value
+
+    def spread(self, begin: Array, end: Array) -> tuple[Array, Array]:
+        """Those times of the pieces which those of their segments make. All that is asked of a piece depends on the
+        latter alone: where errors grow by many powers of ten, times of its own would take theirs from rounding."""
+        if self.pieces == 1:
+            return begin, end
+        a, b = begin[:: self.pieces, None], end[self.pieces - 1 :: self.pieces, None]
+        inner = a + (b - a) * jnp.arange(1, self.pieces, dtype=begin.dtype) / self.pieces
+        return jnp.concatenate([a, inner], 1).ravel(), jnp.concatenate([inner, b], 1).ravel()
 
     def pack(self, start: Start, value: Any) -> np.ndarray:
         capacity, n = len(start.itinerary.slot), len(self.sizes)
@@ -122,7 +134,8 @@ class OrbitCurve(eqx.Module):
         """What vanishes: for each segment its beginning in time and state, and what ends it. Also the time at which the
         last segment ends, and the states at the ends."""
         begin, end, x, value = self.parts(u)
-        rows = len(begin)
+        given, rows = (begin, end), len(begin)
+        begin, end = self.spread(begin, end)
         model = self.model_at(value)
         flow = self.flow(model)
         index = jnp.arange(rows, dtype=itinerary.num.dtype)
@@ -153,9 +166,11 @@ class OrbitCurve(eqx.Module):
         forced = None if self.autonomous else jnp.asarray(model.system.period, end.dtype) * self.order.astype(end.dtype)
         arrival = (end + rest)[before]
         anchor = jnp.zeros_like(end[0]) if forced is None else arrival[0] - forced
-        if not self.autonomous:
-            anchor = jnp.where(itinerary.ends[0] == TIME, lax.stop_gradient(origin[0] * self.time), anchor)
+        # What begins away from events keeps its beginning.
+        anchor = jnp.where(itinerary.ends[itinerary.num - 1] == TIME, origin[0] * self.time, anchor)
         started = begin - jnp.where(index == 0, anchor, arrival)
+        if self.pieces > 1:
+            started = jnp.where(index % self.pieces == 0, started, given[0] - begin)
 
         def ended(a: Scalar, b: Scalar, x: Array, last: Array, mode: Array, part: Array, *what: Array) -> Scalar:
             slot, entry, ends = what
@@ -170,33 +185,51 @@ class OrbitCurve(eqx.Module):
                         holding = jnp.where(here, holding - model.bound(k), holding)
                 out = jnp.where(ends == REPELLING_EXIT, holding, out)
             out = out / (jnp.asarray(self.guard_sizes)[slot] if model.slots else 1)
-            closing = self.normal @ (x - self.reference) if forced is None else b - a - forced
+            closing = self.normal @ (first - self.reference) if forced is None else b - begin[0] - forced
             return jnp.where(ends == TIME, closing, out)
 
-        finish = jax.vmap(ended)(begin, end, x, last, mode, part, itinerary.slot, itinerary.entry, itinerary.ends)
+        first, since, whence = x[0], begin, x
+        if self.pieces > 1:  # what holds where a segment begins holds at its first piece
+            opening = jnp.where(itinerary.ends == REPELLING_EXIT, index - (self.pieces - 1), index)
+            since, whence = begin[opening], x[opening]
+        what = itinerary.slot, itinerary.entry, itinerary.ends
+        finish = jax.vmap(ended)(since, end, whence, last, mode, part, *what)
+        if self.pieces > 1:
+            finish = jnp.where(itinerary.ends == PIECE, (given[1] - end) / self.time, finish)
         # In the units of the unknowns.
         whole = jnp.concatenate([started[:, None] / self.time, finish[:, None], (x - after[before]) / self.sizes], 1)
-        fill = (u - lax.stop_gradient(origin))[: -self.dimension].reshape(rows, -1)
+        fill = (u - origin)[: len(u) - self.dimension].reshape(rows, -1)
         return jnp.where(happened[:, None], whole, fill).ravel(), arrival[0] / self.time, last
 
 
 def guard_sizes(curve: OrbitCurve, start: Start) -> np.ndarray:
     """What a unit of the unknowns makes of each guard: from their gradients at the beginnings of the segments."""
-
-    if not curve.model.slots:
-        return np.zeros(0)
-    rows = start.itinerary.rows
-    seen = [
-        _gradients(curve, start.begin[i], start.x[i], start.itinerary.mode[i], start.itinerary.part[i]) for i in rows
-    ]
-    # Those of a switch that is held are seen in that mode alone.
-    every = np.stack([np.ones(len(curve.model.switches), np.int32) * m for m in (-1, 0, 1)])
-    seen += [_gradients(curve, start.begin[0], start.x[0], mode, start.itinerary.part[0]) for mode in every]
-    found = np.max(np.abs(np.asarray(seen)), axis=0)
-    return np.where(np.isfinite(found) & (found > 0), found, 1.0)
+    filled, n = start.filled(), len(start.begin)
+    rows = np.minimum(np.arange(len(filled.itinerary.slot)), n - 1)
+    return np.asarray(_guard_sizes(curve, filled.itinerary, start.begin[rows], start.x[rows]))
 
 
 @interactive
+def _guard_sizes(curve: OrbitCurve, itinerary: OrbitItinerary, begin: Array, x: Array) -> Array:
+    return guard_sizes_at(curve, itinerary, begin, x)
+
+
+def guard_sizes_at(
+    curve: OrbitCurve, itinerary: OrbitItinerary, begin: Float[Array, " rows"], x: Float[Array, "rows n"]
+) -> Float[Array, " slots"]:
+    """`guard_sizes` within a program."""
+    if not curve.model.slots:
+        return jnp.zeros(0, x.dtype)
+    mode, part = jnp.asarray(itinerary.mode), jnp.asarray(itinerary.part)
+    # Those of a switch that is held are seen in that mode alone.
+    every = jnp.stack([jnp.full_like(mode[0], m) for m in (-1, 0, 1)])
+    segments = begin, x, mode, part
+    extra = *(jnp.repeat(column[:1], 3, axis=0) for column in (begin, x)), every, jnp.repeat(part[:1], 3, axis=0)
+    rows = [jnp.concatenate(pair) for pair in zip(segments, extra)]
+    found = jnp.max(jax.vmap(lambda *row: _gradients(curve, *row))(*rows), axis=0)
+    return jnp.where(jnp.isfinite(found) & (found > 0), found, 1.0)
+
+
 def _gradients(curve: OrbitCurve, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
     """The largest component of the gradient of each guard, by the unknowns."""
     state = curve.state(mode, part)

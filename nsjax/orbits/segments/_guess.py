@@ -7,7 +7,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ..._numerics._compile import interactive
 from ..._types import Scalar, Y
@@ -22,6 +22,7 @@ from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ...system._system import System
 from .._guess import base_point
+from ._itinerary import EVENT, event_slot, OrbitItinerary, REPELLING_EXIT, TIME
 
 
 class Segment(NamedTuple):
@@ -48,15 +49,14 @@ class SegmentGuess(NamedTuple):
     begin: Float[Array, " rows"]  # guesses
     end: Float[Array, " rows"]
     y: Y  # at the beginnings
-    within: ModeState  # the mode, and the components of h that are active, at the beginnings
-    ending: ModeState  # the same at the ends
-    switch: Int[Array, " rows"]  # whose event ends it
-    num: Int[Array, ""]  # the row of the last segment, which ends where the first begins
-    free: tuple[bool, ...]
+    itinerary: OrbitItinerary  # the last segment ends where the first begins
+    free: tuple[bool, ...]  # whether it slides on a surface that repels
 
     def first(self, rows: int) -> "SegmentGuess":
-        cut = jax.tree.map(lambda x: x[:rows], self._replace(num=(), free=()))
-        return cut._replace(num=self.num, free=self.free[:rows])
+        num, free = self.itinerary.num, self.free[:rows]
+        itinerary = self.itinerary._replace(num=())
+        cut = jax.tree.map(lambda x: x[:rows], self._replace(itinerary=itinerary, free=()))
+        return cut._replace(itinerary=cut.itinerary._replace(num=num), free=free)
 
 
 def where(rows: Array, a: Any, b: Any) -> Any:
@@ -82,13 +82,33 @@ def cuts_of(system: System, sol: Solution, t0: Scalar, y0: Y) -> SegmentGuess:
         return where(index <= num, rows, jax.tree.map(lambda r, v: jnp.broadcast_to(v[num], r.shape), rows, value))
 
     begin, end, y, modes, last = fill(begin, end), fill(end, end), fill(y, last), fill(modes, modes), fill(last, last)
-
-    def state(t: Scalar, y: Y, mode: Array) -> ModeState:
-        return model.state_at(t, y, tuple(mode))
-
     switch = jnp.append(events.switch, jnp.asarray(-1, events.switch.dtype))
-    within, ending = jax.vmap(state)(begin, y, modes), jax.vmap(state)(end, last, modes)
-    return SegmentGuess(begin, end, y, within, ending, jnp.where(index < num, switch, -1), num, (False,) * len(begin))
+    switch, free = jnp.where(index < num, switch, -1), (False,) * len(begin)
+    itinerary = _itinerary(model, (begin, y), (end, last), modes, switch, num + 1, free)
+    return SegmentGuess(begin, end, y, itinerary, free)
+
+
+def _itinerary(
+    model: SwitchedSystem,
+    first: tuple[Array, Y],
+    last: tuple[Array, Y],
+    mode: Array,
+    switch: Array,
+    num: Array,
+    free: tuple[bool, ...],
+) -> OrbitItinerary:
+    """From times and states at beginnings and ends of the segments, their modes, and the switches that end them."""
+    states = jax.vmap(lambda t, y, mode: model.state_at(t, y, tuple(mode)))(*first, mode)
+    zero = jnp.zeros(len(mode), jnp.int32)
+    part = [zero if p is None else p for p in states.part]
+    slides = jnp.asarray(free)
+    # What slides on a surface that repels is at its bound where it comes onto it.
+    t, y = where(slides, first, last)
+    slot, entry = jax.vmap(lambda k, t, y, mode: event_slot(model, k, t, y, mode))(switch, t, y, mode)
+    ends = jnp.where(slides, REPELLING_EXIT, EVENT)
+    ends = jnp.where(jnp.arange(len(mode), dtype=num.dtype) == num - 1, TIME, ends).astype(jnp.int32)
+    parts = jnp.stack(part, axis=1) if part else jnp.zeros((len(mode), 0), jnp.int32)
+    return OrbitItinerary(mode.astype(jnp.int32), parts, ends, slot, entry, num)
 
 
 def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, integrator: Integrator) -> SegmentGuess:
@@ -128,20 +148,13 @@ def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, in
         y1 = integrate(ModeFlow(model, within), t, end, y, integrator).y1
         ending = model.state_at(end, y1, tuple(mode))
         y_next, rest = landing(model, k, end, y1, ending, tuple(after))
-        return (end + rest, y_next), (t, end, y, within, ending)
+        return (end + rest, y_next), (t, end, y, y1)
 
     rows = (mode, jnp.roll(mode, -1, axis=0), switch, durations)
-    _, (begin, end, y, within, ending) = lax.scan(follow, (t0, y0), rows)
-    return SegmentGuess(
-        begin,
-        end,
-        y,
-        within,
-        ending,
-        switch,
-        jnp.asarray(len(segments) - 1, jnp.int32),
-        tuple(s.free for s in segments),
-    )
+    _, (begin, end, y, last) = lax.scan(follow, (t0, y0), rows)
+    free, num = tuple(s.free for s in segments), jnp.asarray(len(segments), jnp.int32)
+    itinerary = _itinerary(model, (begin, y), (end, last), mode, switch, num, free)
+    return SegmentGuess(begin, end, y, itinerary, free)
 
 
 def _mode(names: list[str], mode: Any) -> tuple[int, ...]:
@@ -166,7 +179,7 @@ def cuts_near(
         period = jnp.asarray(system.period, t0.dtype) * order
     sol = integrate(system, t0, t0 + period, y0, integrator, mode=mode)
     cuts = cuts_of(system, sol, t0, y0)
-    return cuts, is_okay(sol.result) & ((cuts.num > 0) | (sol.events.num == 0))
+    return cuts, is_okay(sol.result) & ((cuts.itinerary.num > 1) | (sol.events.num == 0))
 
 
 def landing(model: SwitchedSystem, k: Array, t: Scalar, y: Y, ending: ModeState, after: tuple) -> tuple[Y, Scalar]:

@@ -21,8 +21,9 @@ from .._orbit import Orbit
 
 # What ends a segment: a guard falls to zero; a period has passed (of an orbit without events); a guard is least there
 # (a cut that changes nothing, at which its value is watched); or nothing does: it slides on a surface that repels, onto
-# which it came tangentially (section 6.7).
-EVENT, TIME, GRAZING, REPELLING_EXIT = range(4)
+# which it came tangentially (section 6.7). In multiple shooting nothing happens at the end of a piece but the last of a
+# segment: the next is as long.
+EVENT, TIME, GRAZING, REPELLING_EXIT, PIECE = range(5)
 
 
 class OrbitItinerary(NamedTuple):
@@ -33,7 +34,7 @@ class OrbitItinerary(NamedTuple):
 
     mode: Int[np.ndarray, "rows switches"]
     part: Int[np.ndarray, "rows switches"]  # of a surface that holds the segment and has several components: which
-    ends: Int[np.ndarray, " rows"]  # EVENT, TIME, GRAZING or REPELLING_EXIT
+    ends: Int[np.ndarray, " rows"]  # EVENT, TIME, GRAZING, REPELLING_EXIT or PIECE
     slot: Int[np.ndarray, " rows"]  # the guard that ends it
     entry: Int[np.ndarray, " rows"]  # and its component
     num: Int[np.ndarray, ""]
@@ -86,14 +87,35 @@ def slot_of(model: SwitchedSystem, k: int, holding: bool, part: int) -> int:
     return next(i for i, s in enumerate(model.slots) if (s.switch, s.holding, s.part) == (k, holding, part))
 
 
-def event_slot(model: SwitchedSystem, k: int, mode: Any, part: int, multiplier: float) -> tuple[int, int]:
-    """The guard, and its component, at whose zero switch k has its event in `mode`: `part` is the component of h that
-    is at zero, `multiplier` the value of the switch if it holds."""
-    if k in model.holdable and model.held(k, mode):
-        return slot_of(model, k, True, 1 if k in model.contacts or multiplier > 0 else -1), 0
-    if isinstance(model.switches[k], sgn) and model.parts[k] > 1 and mode < 0:
-        return slot_of(model, k, False, 0), part
-    return slot_of(model, k, False, part), 0
+def nearest_parts(model: SwitchedSystem, t: Scalar, y: Y) -> Int[Array, " switches"]:
+    """The component of every h that is nearest to zero."""
+    each = [model.h(k, t, y) for k in range(len(model.switches))]
+    nearest = [jnp.argmin(jnp.abs(jnp.stack(h))) if len(h) > 1 else jnp.zeros((), int) for h in each]
+    return jnp.stack(nearest).astype(jnp.int32)
+
+
+def event_slot(
+    model: SwitchedSystem, k: Array, t: Scalar, y: Y, mode: Int[Array, " switches"]
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """The guard, and its component, at whose zero switch k (-1: none) has its event in `mode`: that of the component of
+    h that is nearest to zero, or of the bound that the value of a switch which holds is at."""
+    slot = entry = jnp.zeros((), jnp.int32)
+    if not model.switches:
+        return slot, entry
+    parts, values = nearest_parts(model, t, y), model.values(t, y, model.state_at(t, y, tuple(mode)))
+    for i, switch in enumerate(model.switches):
+        first, inside = slot_of(model, i, False, 0), jnp.zeros_like(entry)
+        here = first + parts[i]
+        if isinstance(switch, sgn) and model.parts[i] > 1:  # below its components are one guard
+            below = mode[i] < 0
+            here, inside = jnp.where(below, first, here), jnp.where(below, parts[i], 0)
+        if i in model.holdable:
+            up = slot_of(model, i, True, 1)
+            bound = up if i in model.contacts else jnp.where(values[i] > 0, up, slot_of(model, i, True, -1))
+            held = model.held(i, mode[i])
+            here, inside = jnp.where(held, bound, here), jnp.where(held, 0, inside)
+        slot, entry = (jnp.where(k == i, now, old).astype(jnp.int32) for now, old in ((here, slot), (inside, entry)))
+    return slot, entry
 
 
 class EventRecord(NamedTuple):
@@ -121,21 +143,14 @@ class EventRecord(NamedTuple):
 
 @interactive
 def _looked_at(model: SwitchedSystem, like: Y, systems: System, diaries: EventRecord) -> tuple[Array, Array, Array]:
-    """At each event of each orbit the component of every h that is nearest to zero, before it and after; and the
-    multiplier of the switch that has it."""
+    """At each event of each orbit its guard and the component of that; and the component of every h that is nearest to
+    zero after it."""
     unravel = jfu.ravel_pytree(like)[1]
-
-    def nearest(model: SwitchedSystem, t: Scalar, y: Y) -> Array:
-        each = [model.h(k, t, y) for k in range(len(model.switches))]
-        return jnp.stack([jnp.argmin(jnp.abs(jnp.stack(h))) if len(h) > 1 else jnp.zeros((), int) for h in each])
 
     def event(system: System, t: Scalar, switch: Array, modes: Any, rows: Any) -> tuple[Array, Array, Array]:
         here = model.with_system(system)
         before, after = map(unravel, rows)
-        values = here.values(t, before, here.state_at(t, before, tuple(modes[0])))
-        holdable = jnp.asarray([k in here.holdable for k in range(len(here.switches))])
-        multiplier = jnp.where(holdable, jnp.stack(values), 0)[switch]
-        return nearest(here, t, before), nearest(here, t, after), multiplier
+        return *event_slot(here, switch, t, before, modes[0]), nearest_parts(here, t, after)
 
     return jax.vmap(lambda system, diary: jax.vmap(partial(event, system))(*diary))(systems, diaries)
 
@@ -166,7 +181,7 @@ def starts_from(
         found = jax.device_get(_looked_at(model, like, stacked, rows))
         seen = {i: jax.tree.map(lambda x: x[j], found) for j, i in enumerate(eventful)}
     return [
-        _start(model, diary, seen[i], period) if i in seen else _uneventful(*at[i])
+        _start(diary, seen[i], period) if i in seen else _uneventful(*at[i])
         for i, (diary, (_, period, _, _)) in enumerate(zip(diaries, at))
     ]
 
@@ -177,21 +192,16 @@ def _uneventful(t0: float, period: float, mode: np.ndarray, x0: np.ndarray) -> S
     return Start(itinerary, np.array([t0]), np.array([t0 + period]), x0[None])
 
 
-def _start(model: SwitchedSystem, diary: EventRecord, seen: tuple, period: float) -> Start:
+def _start(diary: EventRecord, seen: tuple, period: float) -> Start:
     """From each event to the next."""
     n = len(diary.t)
-    parts_before, parts_after, multipliers = seen
-    guards = []
-    for i in [*range(1, n), 0]:
-        k = int(diary.switch[i])
-        guards.append(event_slot(model, k, diary.modes[0][i, k], int(parts_before[i, k]), float(multipliers[i])))
-    slot, entry = np.array(guards, np.int32).T
+    slot, entry, parts_after = (column[:n] for column in seen)
     itinerary = OrbitItinerary(
         diary.modes[1].astype(np.int32),
-        parts_after[:n].astype(np.int32),
+        parts_after,
         np.full(n, EVENT, np.int32),
-        slot,
-        entry,
+        np.roll(slot, -1),
+        np.roll(entry, -1),
         np.asarray(n, np.int32),
     )
     return Start(itinerary, diary.t, np.append(diary.t[1:], diary.t[0] + period), diary.states[1])

@@ -5,19 +5,18 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.flatten_util as jfu
-import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
 from ..._numerics._compile import interactive
-from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, RESOLVED
 from ..._numerics._root import Newton
 from ..._types import Scalar
 from ...derivatives._floquet import floquet, structural_zeros
-from ...system._mode import OFF
 from ...system._model import SwitchedSystem
+from ._corrector import Linear, newton_turns, Plane
 from ._equations import OrbitCurve, row_sizes
+from ._guard_minima import along_orbit
 from ._itinerary import EVENT, OrbitItinerary, REPELLING_EXIT, TIME
 from ._segment_flow import states_along
 
@@ -86,20 +85,6 @@ def state_at(curve: OrbitCurve, itinerary: OrbitItinerary, look: PointData, i: i
     return np.asarray(states_along(flow, look.begin[i], np.asarray(t), look.x[i], state))[-1]
 
 
-class Plane(NamedTuple):
-    """Where a point of a curve is looked for: at a `distance` from `origin` along `normal`. (Of a surface, at several
-    distances along as many directions.)"""
-
-    origin: Any
-    normal: Any
-    distance: Any = 0.0
-
-    def filled(self) -> "Plane":
-        """The same with one distance for each direction."""
-        shape = np.shape(self.normal)[:-1]
-        return self._replace(distance=np.broadcast_to(np.asarray(self.distance, float), shape))
-
-
 def correct(
     curve: OrbitCurve, itinerary: OrbitItinerary, plane: Plane, guess: Any = None, newton: bool = True
 ) -> PointData:
@@ -124,59 +109,12 @@ def corrected(
     turns: bool = True,
 ) -> PointData:
     """`correct`, within a program; without `turns` the largest and least states are those at the nodes."""
-    origin, border, distance = plane
-    method, m = Newton(TOLERANCE, 10), curve.dimension
-
-    def turn(c: _Turn) -> _Turn:
-        u, linear = c.next, _linear(curve, itinerary, c.next, origin)
-        off = jnp.append(linear.f, border @ (u - origin) - distance)
-        step = method.step(u, off, jnp.concatenate([linear.df, jnp.atleast_2d(border)]))
-        new, ended, good = (jnp.where(c.ended, old, now) for old, now in zip((u, True, c.good), step))
-        return _Turn(u, new, linear, ended, good, over=c.ended, count=c.count + 1)
-
-    # The last turn has the derivatives at the root, which all that is seen of it begins with: so the equations stand
-    # in the program once.
-    size, rows, n = len(guess), len(itinerary.slot), len(curve.sizes)
-    blank = _Linear(*(jnp.zeros(shape, guess.dtype) for shape in ((size - m,), (rows, n), (size - m, size), (size,))))
-    no = jnp.zeros((), bool)
-    first = _Turn(guess, guess, blank, ended=~jnp.asarray(newton), good=no, over=no, count=jnp.zeros((), jnp.int32))
-    last = lax.while_loop(lambda c: ~c.over & (c.count <= method.max_iterations), turn, first)
+    last = newton_turns(curve, itinerary, plane, guess, Newton(TOLERANCE, 10), newton)
     return _seen(curve, itinerary, last.u, last.linear, last.good, plane, turns)
 
 
-class _Linear(NamedTuple):
-    """The equations and the states at the ends of the segments; the derivatives of the equations, and of the time at
-    which the last segment ends."""
-
-    f: Array
-    last: Array
-    df: Array
-    closing: Array
-
-
-class _Turn(NamedTuple):
-    """Of Newton's method: where it is, and where it goes next."""
-
-    u: Array
-    next: Array
-    linear: _Linear  # at u
-    ended: Bool[Array, ""]  # whether `next` is where it ends
-    good: Bool[Array, ""]
-    over: Bool[Array, ""]  # whether u is
-    count: Array
-
-
-def _linear(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, origin: Array) -> _Linear:
-    def equations(u: Array) -> tuple[tuple[Array, Scalar], tuple[Array, Array]]:
-        f, arrival, last = curve.residual(u, itinerary, origin)
-        return (f, arrival), (f, last)
-
-    (df, closing), (f, last) = jax.jacfwd(equations, has_aux=True)(u)
-    return _Linear(f, last, df, closing)
-
-
 def _seen(
-    curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, linear: _Linear, good: Array, plane: Plane, turns: bool
+    curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, linear: Linear, good: Array, plane: Plane, turns: bool
 ) -> PointData:
     """All that is seen of a point."""
     begin, end, x, value = curve.parts(u)
@@ -193,7 +131,7 @@ def _seen(
     branch = jnp.stack(jnp.linalg.slogdet(jnp.concatenate([df, along])))
     tangent = along.reshape(jnp.shape(border))
 
-    factors = _factors(curve, itinerary, u, df, closing)
+    factors = factors_of(curve, itinerary, u, df, closing)
     index = jnp.arange(rows, dtype=itinerary.num.dtype)
     mode = jnp.asarray(itinerary.mode)
     zeros = structural_zeros(model.system, jnp.where((index < itinerary.num)[:, None], mode, mode[:1]))
@@ -204,7 +142,7 @@ def _seen(
 
     # Along the way.
     inside = (index < itinerary.num)[:, None]
-    along = _along(curve, itinerary, u, turns)
+    along = along_orbit(curve, itinerary, u, turns)
     least = along.least[:, 2 * n :]
     low, high = jnp.min(jnp.where(inside, along.least[:, : 2 * n], jnp.inf), axis=0).reshape(2, n)
     length = jnp.sum(jnp.where(inside[:, 0], end - begin, 0))
@@ -226,12 +164,12 @@ def _seen(
     )  # fmt: skip
 
 
-def _factors(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, df: Array, closing: Array) -> Array:
+def factors_of(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, df: Array, closing: Array) -> Array:
     """The derivatives from the beginning of each segment to that of the next, at the same time: the blocks of `df`, the
     Jacobian of the equations, from which the moved times are eliminated. `closing`: the derivative of the time at which
     the last segment ends."""
     begin, _, x, value = curve.parts(u)
-    n, rows, m = len(curve.sizes), len(begin), curve.dimension
+    n, rows = len(curve.sizes), len(begin)
     model = curve.model_at(value)
     index = jnp.arange(rows, dtype=itinerary.num.dtype)
     after = jnp.where(index >= itinerary.num - 1, 0, index + 1)
@@ -243,13 +181,13 @@ def _factors(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, df: Array, 
         * curve.time
         / curve.sizes
     )
-    blocks = df[:, :-m].reshape(rows, n + 2, rows, n + 2)
+    blocks = df[:, : len(df)].reshape(rows, n + 2, rows, n + 2)
     own, on = blocks[index, :, index], blocks[after, :, index]
     # The next segment of the last one begins where it ends; of a single one it is the same.
     itself = jnp.zeros(n + 2, u.dtype).at[2:].set(1)
     on = jnp.where(itinerary.num == 1, on - jnp.diag(itself), on)
     final = (index == itinerary.num - 1)[:, None]
-    on = on.at[:, 0].set(jnp.where(final, -closing[:-m].reshape(rows, n + 2), on[:, 0]))
+    on = on.at[:, 0].set(jnp.where(final, -closing[: len(df)].reshape(rows, n + 2), on[:, 0]))
     on = jnp.where((itinerary.ends == TIME)[:, None, None], on.at[:, 0].set(0), on)
 
     def factor(own: Array, on: Array, ends: Array, last_field: Array) -> Array:
@@ -270,102 +208,6 @@ def _infinitely_unstable(n: int, autonomous: bool) -> tuple[Array, Array, Array]
     """Monodromy matrix, multipliers, and whether it is stable, of an orbit that slides on a surface that repels."""
     rest = [1.0] * autonomous + [jnp.nan] * (n - 1 - autonomous)
     return jnp.full((n, n), jnp.inf), jnp.array([jnp.inf, *rest], complex), jnp.array(False)
-
-
-@interactive
-def extremes(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> tuple[Array, Array]:
-    """The least and the largest value of each component of the state along an orbit."""
-    found = _along(curve, itinerary, u, turns=True, guards=False).least
-    inside = jnp.arange(len(found), dtype=itinerary.num.dtype) < itinerary.num
-    low, high = jnp.min(jnp.where(inside[:, None], found, jnp.inf), axis=0).reshape(2, -1)
-    return low, -high
-
-
-def _along(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, turns: bool, guards: bool = True) -> Minima:
-    """Of every segment the least values of the state's components, of their negatives (with `turns` between nodes too),
-    and of the guards, these divided by the zeros that they must have at the ends."""
-    begin, end, x, value = curve.parts(u)
-    rows, slots = len(begin), len(curve.model.slots) * guards
-    orders = jnp.zeros((rows, 2, 0), x.dtype)
-    if slots:
-        zeros = jnp.asarray(zeros_at_begin(curve, itinerary), x.dtype)  # rows, slots
-        here = jnp.arange(slots, dtype=itinerary.slot.dtype) == itinerary.slot[:, None]
-        index = jnp.arange(rows, dtype=itinerary.num.dtype)
-        after = jnp.where(index >= itinerary.num - 1, 0, index + 1)
-        # On what is left freely it comes tangentially.
-        order = jnp.where(itinerary.ends[after] == REPELLING_EXIT, 2, 1)[:, None]
-        last = jnp.where((itinerary.ends == EVENT)[:, None] & here, order, 0)
-        orders = jnp.stack([zeros, last.astype(x.dtype)], axis=1)
-    plain = jnp.zeros((rows, 2, 2 * len(curve.sizes)), x.dtype)
-    orders = jnp.concatenate([plain, orders], axis=2)
-    segments = begin, end, x, jnp.asarray(itinerary.mode), jnp.asarray(itinerary.part)
-    return jax.vmap(lambda segment, orders: along_segment(curve, value, segment, orders, turns))(segments, orders)
-
-
-def along_segment(curve: OrbitCurve, value: Array, segment: tuple, orders: Array, turns: bool) -> Minima:
-    """As `_along`, of one segment (its two times, its first state, mode and parts), with any orders of the zeros."""
-    a, b, x, mode, part = segment
-    model = curve.model_at(value)
-    flow = curve.flow(model)
-    n, state = len(curve.sizes), curve.state(mode, part)
-    slots = orders.shape[1] - 2 * n
-    slack = jnp.concatenate(
-        [jnp.asarray(size, x.dtype) for size in (curve.sizes, curve.sizes, curve.guard_sizes[:slots])]
-    )
-
-    def sample(first: Scalar, last: Scalar, x: Array) -> tuple[Array, Array, Array]:
-        end = jnp.where(last < 1, a + (b - a) * last, b)
-        return flow.along(a + (b - a) * first, end, x, state)
-
-    def rows(t: Scalar, x: Array) -> list[list[Array]]:
-        guards = curve.guard_rows(model, t, x, state) if slots else []
-        return [*([x[i]] for i in range(n)), *([-x[i]] for i in range(n)), *guards]
-
-    places = places_of(jax.eval_shape(rows, a, x))
-
-    def functions(ts: Array, xs: Array) -> tuple[list[Array], Array]:
-        return grouped(jax.vmap(rows)(ts, xs)), RESOLVED * slack[places]
-
-    def below(most: Array) -> Array:
-        # The least value of a guard is of interest where it is about to vanish.
-        return jnp.where(places < 2 * n, jnp.inf if turns else -jnp.inf, 0.1 * most)
-
-    return in_order(minima(sample, functions, x, orders[:, places], below), places)
-
-
-def zeros_at_begin(curve: OrbitCurve, itinerary: OrbitItinerary) -> Array:
-    """How many zeros each guard has at the beginning of each segment: that of the surface just left."""
-    model = curve.model
-    index = jnp.arange(len(itinerary.slot), dtype=itinerary.num.dtype)
-    before = jnp.where(index == 0, itinerary.num - 1, index - 1)
-    slot, ends, mode_before = itinerary.slot[before], itinerary.ends[before], jnp.asarray(itinerary.mode)[before]
-    mode = jnp.asarray(itinerary.mode)
-    columns = []
-    switch = jnp.asarray([s.switch for s in model.slots], jnp.int32)[slot]
-    entry = itinerary.entry[before]
-    part = jnp.asarray([s.part for s in model.slots], jnp.int32)[slot]
-    component = jnp.where(entry > 0, entry, jnp.where(part >= 0, part, 0))
-    for s in model.slots:
-        k = s.switch
-        left = (switch == k) & ((ends == EVENT) | (ends == REPELLING_EXIT))
-        if s.holding or model.switches[k].order == 0:
-            columns.append(jnp.zeros(len(index)))
-            continue
-        free = jnp.ones(len(index), bool)
-        order = jnp.ones(len(index))
-        if model.conditional(k):
-            left = left & (mode[:, k] != OFF)
-        if k in model.holdable:
-            free = ~model.held(k, mode[:, k])
-            slid = model.held(k, mode_before[:, k])
-            if k in model.contacts:
-                order = jnp.where(slid, 3, 1)
-            elif not model.static(k):
-                order = jnp.where(slid, 2, 1)
-        if model.parts[k] > 1:  # above, each component is a guard of its own; below, they are one
-            free = free & (jnp.where(mode[:, k] < 0, 0, component) == s.part)
-        columns.append(jnp.where(left & free, order, 0))
-    return jnp.stack([c.astype(jnp.result_type(float)) for c in columns], axis=1)
 
 
 def _at_ends(

@@ -28,6 +28,7 @@ from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 
 
+TRUSTED = 1e2  # dense output may err by this many tolerances of the steps
 NEVER, FREE_MODES, ALWAYS = range(3)  # when a mode's flow is known by its exponential
 
 
@@ -39,6 +40,13 @@ class SegmentFlow(eqx.Module):
     integrator: Integrator = eqx.field(static=True)
     exact: bool = eqx.field(static=True)
     slides: bool = eqx.field(static=True)  # whether modes that are held occur
+
+    @property
+    def missed(self) -> float:
+        """By which part of a state of size one its dense output may be wrong."""
+        found = [getattr(self.integrator.stepsize_controller, name, 0.0) for name in ("rtol", "atol")]
+        worst = max(float(np.max(x)) for tolerance in found for x in jax.tree.leaves(tolerance) or [0.0])
+        return 0.0 if self.exact else TRUSTED * worst
 
     def unravel(self, x: Array) -> Y:
         return jfu.ravel_pytree(self.like)[1](x)

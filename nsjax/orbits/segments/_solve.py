@@ -4,143 +4,41 @@ Each segment is a smooth flow in a mode that is given. So the equations stay wel
 surface that repels, and for orbits that no solution follows for a whole period.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
-import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Float
 
 from ..._numerics._autodiff import frozen
 from ..._numerics._compile import interactive
-from ..._numerics._root import find_root, Newton
-from ..._types import Scalar, Y
+from ..._numerics._root import Newton
+from ..._types import Scalar
 from ...derivatives._floquet import floquet, forwards, structural_zeros
-from ...derivatives._saltation import event_function, saltation_matrices
+from ...derivatives._saltation import saltation_matrices
 from ...flow._integrator import Integrator
 from ...flow._results import is_okay, RESULTS
 from ...flow._solution import Events
 from ...flow.events._locate import cosine
-from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ...system._system import System
 from .._orbit import fractions, judge, Orbit, ravel
-from ._arcs import Arcs, Flows, SAMPLES
-from ._guess import landing, SegmentGuess, where
-
-
-def _guard(model: SwitchedSystem, k: Array, t: Scalar, y: Y, state: ModeState) -> Scalar:
-    out = jnp.zeros_like(t)
-    for i in range(len(model.switches)):
-        out = jnp.where(k == i, event_function(model, i, t, y, state), out)
-    return out
-
-
-def _tangency(model: SwitchedSystem, k: Array, t: Scalar, y: Y, state: ModeState) -> Scalar:
-    """|λ| - 1: zero where the field beside the surface becomes parallel to it."""
-    values, out = model.values(t, y, state), jnp.zeros_like(t)
-    for i in model.holdable:
-        out = jnp.where(k == i, jnp.abs(values[i]) - 1, out)
-    return out
-
-
-class _Cycle(eqx.Module):
-    """The equations of all segments of an orbit.
-
-    The unknowns of a segment are its times of beginning and end, and its states at the beginning of each of its pieces.
-    """
-
-    cuts: SegmentGuess
-    t0: Scalar
-    y0: Y
-    order: int = eqx.field(static=True)
-    pieces: int = eqx.field(static=True)
-    integrator: Integrator = eqx.field(static=True)
-
-    @property
-    def index(self) -> Int[Array, " rows"]:
-        return jnp.arange(len(self.cuts.begin), dtype=self.cuts.num.dtype)
-
-    @property
-    def happened(self) -> Bool[Array, " rows"]:
-        """Which segments end with an event."""
-        return self.index < self.cuts.num
-
-    @property
-    def following(self) -> tuple[Array, ...]:
-        return tuple(jnp.where(self.happened, jnp.roll(m, -1), m) for m in self.cuts.within.mode)
-
-    def unravel(self, x: Array) -> Y:
-        return jfu.ravel_pytree(self.y0)[1](x)
-
-    def flows(self, system: System, pieces: int | None = None) -> Flows:
-        return Flows(system, self.cuts.within, self.t0, self.y0, pieces or self.pieces, self.integrator)
-
-    def conditions(self, system: System, begin: Array, end: Array, first: Array, last: Array) -> tuple[Array, Array]:
-        """What vanishes at the end of every segment, and what does at the beginning of those that are free."""
-        model, cuts = SwitchedSystem.forwards(system, self.t0, self.y0), self.cuts
-        at_end = jax.vmap(lambda k, t, x, s: _guard(model, k, t, self.unravel(x), s))
-        at_end = at_end(cuts.switch, end, last, cuts.ending)
-        if not any(cuts.free):
-            return at_end, at_end
-        at_begin = jax.vmap(lambda k, t, x, s: _tangency(model, k, t, self.unravel(x), s))
-        return at_end, at_begin(cuts.switch, begin, first, cuts.within)
-
-    def jumps(self, system: System, end: Array, last: Array) -> tuple[Array, Array]:
-        """The states after the events, and the times up to where impacts have come to rest."""
-        model = SwitchedSystem.forwards(system, self.t0, self.y0)
-
-        def row(k: Array, t: Scalar, x: Array, ending: ModeState, after: tuple) -> tuple[Array, Scalar]:
-            y, rest = landing(model, k, t, self.unravel(x), ending, after)
-            return ravel(y), rest
-
-        return jax.vmap(row)(self.cuts.switch, end, last, self.cuts.ending, self.following)
-
-    def first_look(self, system: System) -> tuple[tuple, tuple, Array]:
-        """A guess of the unknowns; how fast the conditions change there (divided by that they are times, whatever the
-        units of h); and the normal of the section on which an autonomous orbit begins."""
-        cuts = self.cuts
-        begin, end, first = cuts.begin, cuts.end, jax.vmap(ravel)(cuts.y)
-        _, xs = self.flows(system, 1).paths(begin, end, first[:, None])
-        x = xs[:, :: SAMPLES // self.pieces][:, : self.pieces] if self.pieces > 1 else first[:, None]
-        model = SwitchedSystem.forwards(system, self.t0, self.y0)
-        field = jax.vmap(lambda t, x, s: ravel(model.flow(t, self.unravel(x), s)))
-        now = (begin, end, first, xs[:, -1])
-        one = jnp.ones_like(begin)
-        moves = (one, one, field(begin, first, cuts.within), field(end, xs[:, -1], cuts.ending))
-        _, rates = jax.jvp(lambda *a: self.conditions(system, *a), now, moves)
-        # What comes onto a surface tangentially, to be left freely, has none there: the better the guess, the less.
-        tangential = jnp.asarray(cuts.free[1:] + cuts.free[:1])
-        rates = (jnp.where(tangential, 1, rates[0]), rates[1])
-        rates = jax.tree.map(lambda r: jnp.where((r == 0) | ~jnp.isfinite(r), 1, r), rates)
-        normal = moves[2][0]
-        return (begin, end, x), rates, normal / jnp.where(normal @ normal == 0, 1, normal @ normal)
-
-    def residual(self, z: tuple, system: System, rates: tuple, normal: Array) -> tuple:
-        """The states at the cuts, what ends each segment (or begins it), and when it begins."""
-        begin, end, x = z
-        ends = self.flows(system).ends(begin, end, x)
-        last = ends[:, -1]
-        after, rest = self.jumps(system, end, last)
-        at_end, at_begin = self.conditions(system, begin, end, x[:, 0], last)
-        ended = jnp.where(jnp.asarray(self.cuts.free), at_begin / rates[1], at_end / rates[0])
-        if system.period is None:
-            closing = jnp.broadcast_to(normal @ (x[0, 0] - ravel(self.y0)), end.shape)
-        else:
-            closing = end - self.t0 - self.order * jnp.asarray(system.period, end.dtype)
-        ended = jnp.where(self.happened, ended, jnp.where(self.index == self.cuts.num, closing, end - begin))
-        return (
-            x[:, 0] - jnp.roll(after, 1, axis=0),
-            x[:, 1:] - ends[:, :-1],
-            ended,
-            begin - jnp.append(self.t0, (end + rest)[:-1]),
-        )
+from ._arcs import Arcs
+from ._corrector import isolated_orbit, Linear
+from ._equations import guard_sizes_at, OrbitCurve
+from ._guard_minima import along_segment
+from ._guess import SegmentGuess, where
+from ._itinerary import EVENT, OrbitItinerary, PIECE
+from ._point import factors_of
+from ._segment_flow import NEVER
 
 
 @interactive
 def by_segments(
     system: System,
-    cuts: SegmentGuess,
+    guess: SegmentGuess,
     t0: Scalar,
     order: int,
     pieces: int,
@@ -148,43 +46,44 @@ def by_segments(
     newton: Newton,
 ) -> Orbit:
     """Newton's method on the equations of all segments, and what is said of the orbit."""
-    autonomous = system.period is None
-    still = frozen(system)
-    cuts = frozen(cuts)
-    y0 = jax.tree.map(lambda x: x[0], cuts.y)
-    cycle = _Cycle(cuts, t0, y0, order, pieces, integrator)
-    guess, rates, normal = frozen(cycle).first_look(still)
-
-    def residual(z: tuple, parameters: tuple) -> tuple:
-        system, cycle = parameters
-        return cycle.residual(z, system, rates, normal)
-
-    z, converged = find_root(residual, guess, (system, cycle), newton)
-    begin, end, x = z
-    error = jnp.max(jnp.abs(jnp.concatenate([r.ravel() for r in residual(frozen(z), (still, cycle))])))
-    size = 1 + jnp.max(jnp.abs(x))
-    good = converged & (error <= 1e3 * newton.tol * size)
-    period = end[-1] - t0 if autonomous else jnp.asarray(system.period, t0.dtype) * order
+    guess = frozen(guess)
+    curve, itinerary, start = _problem(system, guess, t0, order, pieces, integrator)
+    u, linear, converged = isolated_orbit(curve, itinerary, start.at[0].set(t0), start, newton)
+    begin, end, x, _ = curve.parts(u)
+    error = jnp.max(jnp.abs(linear.f))
+    good = converged & (error <= 1e3 * newton.tol * (1 + jnp.max(jnp.abs(x))))
+    autonomous, num = curve.autonomous, itinerary.num
+    period = end[num - 1] - t0 if autonomous else jnp.asarray(system.period, t0.dtype) * order
+    still, here = frozen((curve, u))
     _, shares = fractions(autonomous, order)
-    here = lax.stop_gradient((begin, end, x))
-    later = cycle.flows(still).at(t0 + lax.stop_gradient(period) * jnp.asarray(shares, t0.dtype), *here)
-    result = judge(good, x[0, 0], later, autonomous, order)
+    later = _states_at(still, itinerary, here, t0 + lax.stop_gradient(period) * jnp.asarray(shares, t0.dtype))
+    result = judge(good, x[0], later, autonomous, order)
 
-    ends, phi = cycle.flows(system).derivatives(begin, end, x)
-    events = _log(system, cycle, end, ends[:, -1])
-    monodromy, multipliers, stable, zeros = _floquet(system, cycle, events, phi)
+    events = _log(curve, itinerary, u, linear)
+    index = jnp.arange(len(begin), dtype=num.dtype)
+    mode = itinerary.mode
+    zeros = structural_zeros(system, jnp.where((index < num)[:, None], mode, mode[:1]))
+    if any(guess.free):
+        monodromy, multipliers, stable = _backwards(curve, itinerary, u, linear, events, guess.free)
+    else:
+        monodromy, multipliers, stable = floquet(
+            factors_of(curve, itinerary, u, linear.df, linear.closing), zeros, autonomous
+        )
     # Where a free segment begins it is tangential that it must be.
-    meant = jnp.roll(jnp.asarray(cuts.free), -1)
-    grazes = jnp.any(cycle.happened & ~meant & (events.transversality < jnp.cbrt(jnp.finfo(end.dtype).eps)))
-    violation, violation_t = _violation(still, cycle, *here)
+    meant = jnp.roll(jnp.asarray(guess.free), -1)
+    happened = jnp.isfinite(events.t)
+    grazes = jnp.any(happened & ~meant & (events.transversality < jnp.cbrt(jnp.finfo(end.dtype).eps)))
+    violation, violation_t = _violation(still, itinerary, here)
     admissible = (violation == 0) & jnp.all(end - begin >= -1e3 * newton.tol * (1 + jnp.abs(period)))
     result = RESULTS.where((result == RESULTS.successful) & grazes, RESULTS.tangential_event, result)
     result = RESULTS.where(is_okay(result) & ~admissible, RESULTS.orbit_not_admissible, result)
+    every = slice(None, None, pieces)
+    states = jax.vmap(jax.vmap(curve.unravel))(x.reshape(-1, pieces, x.shape[1]))
     return Orbit(
         system=system,
         t0=t0,
-        y0=cycle.unravel(x[0, 0]),
-        mode=_modes(cuts.within.mode, begin)[0],
+        y0=curve.unravel(x[0]),
+        mode=mode[0],
         period=period,
         events=events,
         monodromy=monodromy,
@@ -196,88 +95,147 @@ def by_segments(
         violation=violation,
         violation_t=violation_t,
         result=result,
-        arcs=Arcs(begin, end, _modes(cuts.within.mode, begin), jax.vmap(jax.vmap(cycle.unravel))(x)),
+        arcs=Arcs(begin[every], end[pieces - 1 :: pieces], mode[every], states),
         integrator=integrator,
     )
 
 
-def _modes(mode: tuple[Array, ...], rows: Array) -> Int[Array, "rows switches"]:
-    return jnp.stack(mode, axis=1) if mode else jnp.zeros((len(rows), 0), jnp.int32)
+def _problem(
+    system: System, guess: SegmentGuess, t0: Scalar, order: int, pieces: int, integrator: Integrator
+) -> tuple[OrbitCurve, OrbitItinerary, Float[Array, " unknowns"]]:
+    """The curve of one point, without a parameter, the itinerary with a row for each piece, and a guess of the
+    unknowns. They are in the units of the model."""
+    y0 = jax.tree.map(lambda y: y[0], guess.y)
+    model = SwitchedSystem.forwards(system, t0, y0)
+    x = jax.vmap(ravel)(guess.y)
+    n, one, none = x.shape[1], jnp.ones_like(t0), jnp.zeros(0, t0.dtype)
+    rows, still = guess.itinerary, frozen(model)
+    blank = OrbitCurve(
+        model=model,
+        path=(),
+        like=y0,
+        low=none,
+        width=none,
+        sizes=jnp.ones(n, t0.dtype),
+        time=one,
+        guard_sizes=jnp.ones(len(model.slots), t0.dtype),
+        order=jnp.asarray(order, jnp.int32),
+        normal=jnp.zeros(n, t0.dtype),
+        reference=x[0],
+        integrator=integrator,
+        exact=NEVER,
+        slides=bool(model.holdable),
+        pieces=pieces,
+    )
+    f = ravel(still.flow(guess.begin[0], y0, blank.state(rows.mode[0], rows.part[0])))
+    normal = f / jnp.where(f @ f == 0, 1, f @ f)
+    sizes = guard_sizes_at(frozen(blank), rows, guess.begin, x)
+    curve = dataclasses.replace(blank, normal=normal, guard_sizes=sizes)
+    if pieces == 1:
+        return curve, rows, jnp.concatenate([guess.begin[:, None], guess.end[:, None], x], axis=1).ravel()
+    flow, shares = curve.flow(still), jnp.arange(pieces, dtype=t0.dtype) / pieces
+
+    def cut(a: Scalar, b: Scalar, x: Array, mode: Array, part: Array) -> Array:
+        starts = a + (b - a) * shares
+        states = jax.vmap(lambda t: flow.arrive(a, t, x, curve.state(mode, part)))(starts[1:])
+        states = jnp.concatenate([x[None], states])
+        return jnp.concatenate([starts[:, None], jnp.append(starts[1:], b)[:, None], states], axis=1)
+
+    start = jax.vmap(cut)(guess.begin, guess.end, x, rows.mode, rows.part).ravel()
+    mode, part, ends, slot, entry = (jnp.repeat(column, pieces, axis=0) for column in rows[:5])
+    last = jnp.arange(len(ends), dtype=rows.num.dtype) % pieces == pieces - 1
+    ends = jnp.where(last, ends, PIECE)
+    return curve, OrbitItinerary(mode, part, ends, slot, entry, rows.num * pieces), start
 
 
-def _log(system: System, cycle: _Cycle, end: Array, last: Array) -> Events:
+def _states_at(
+    curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, times: Float[Array, " times"]
+) -> Float[Array, "times n"]:
+    """States at given times of the orbit."""
+    begin, _, x, _ = curve.parts(u)
+    index = jnp.arange(len(begin), dtype=itinerary.num.dtype)
+    starts, flow = jnp.where(index < itinerary.num, begin, jnp.inf), curve.flow(curve.model)
+
+    def one(t: Scalar) -> Array:
+        i = jnp.maximum(jnp.searchsorted(starts, t, side="right") - 1, 0)
+        return flow.arrive(begin[i], t, x[i], curve.state(itinerary.mode[i], itinerary.part[i]))
+
+    return jax.vmap(one)(times)
+
+
+def _log(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, linear: Linear) -> Events:
     """The events between the segments."""
-    cuts, happened, following, unravel = cycle.cuts, cycle.happened, cycle.following, cycle.unravel
-    after, rest = cycle.jumps(system, end, last)
-    model = SwitchedSystem.forwards(system, end[0], unravel(last[0]))
+    begin, end, x, _ = curve.parts(u)
+    model, last, pieces = curve.model, slice(curve.pieces - 1, None, curve.pieces), curve.pieces
+    num = (itinerary.num - 1) // pieces
+    rows = jax.tree.map(lambda column: column[last], itinerary._replace(num=()))
+    happened = jnp.arange(len(rows.slot), dtype=num.dtype) < num
 
-    def square(k: Array, t: Scalar, x: Array, s: ModeState) -> Scalar:
-        h_t, n = jax.grad(lambda t, x: _guard(model, k, t, unravel(x), s), argnums=(0, 1))(t, x)
-        return cosine(h_t, n, ravel(model.flow(t, unravel(x), s)))
+    def square(t: Scalar, x: Array, mode: Array, part: Array, slot: Array, entry: Array) -> Scalar:
+        state = curve.state(mode, part)
+        h_t, n = jax.grad(lambda t, x: curve.guard(model, t, x, state, slot, entry), argnums=(0, 1))(t, x)
+        return cosine(h_t, n, ravel(model.flow(t, curve.unravel(x), state)))
 
+    switch = jnp.asarray([slot.switch for slot in model.slots] or [-1], jnp.int32)[rows.slot]
+    t, y = frozen((end[last], linear.last[last]))
+    cosines = jax.vmap(square)(t, y, rows.mode, rows.part, rows.slot, rows.entry)
+    # (Where impacts accumulate the next segment begins later than this one ends.)
     columns = dict(
-        t=end + rest,
-        switch=cuts.switch,
-        mode_before=_modes(cuts.within.mode, end),
-        mode_after=_modes(following, end),
-        y_before=jax.vmap(unravel)(last),
-        y_after=jax.vmap(unravel)(after),
-        transversality=lax.stop_gradient(jax.vmap(square)(cuts.switch, end, last, cuts.ending)),
+        t=jnp.roll(begin[::pieces], -1),
+        switch=switch,
+        mode_before=rows.mode,
+        mode_after=jnp.roll(rows.mode, -1, axis=0),
+        y_before=jax.vmap(curve.unravel)(linear.last[last]),
+        y_after=jax.vmap(curve.unravel)(jnp.roll(x[::pieces], -1, axis=0)),
+        transversality=lax.stop_gradient(cosines),
     )
     empty = {k: jax.tree.map(jnp.zeros_like, v) for k, v in columns.items()}
-    empty |= dict(t=jnp.full_like(end, jnp.inf), switch=jnp.full_like(cuts.switch, -1))
-    names = tuple(k.name for k in system.switches)
-    return Events(**where(happened, columns, empty), num=cuts.num, names=names)
+    empty |= dict(t=jnp.full_like(end[last], jnp.inf), switch=jnp.full_like(switch, -1))
+    names = tuple(k.name for k in model.switches)
+    return Events(**where(happened, columns, empty), num=num, names=names)
 
 
-def _floquet(system: System, cycle: _Cycle, events: Events, phi: Array) -> tuple[Array, Array, Array, Array]:
-    """Monodromy matrix, multipliers, stability and structural zeros, from the derivatives along the segments."""
-    cuts, happened, autonomous = cycle.cuts, cycle.happened, system.period is None
-    eye = jnp.eye(phi.shape[-1], dtype=phi.dtype)
-    none = jnp.broadcast_to(eye, (len(phi), *eye.shape))
-    zeros = structural_zeros(system, _modes(cuts.within.mode, happened))
-    if not any(cuts.free):
-        jumps = where(happened, saltation_matrices(system, events), none)
-        factors = jnp.concatenate([phi, jumps[:, None]], axis=1).reshape(-1, *eye.shape)
-        return *floquet(factors, zeros, autonomous), zeros
-    # Backwards in time a surface that repels attracts: what leaves the surface freely comes onto it there, and has a
-    # saltation matrix. Where it comes onto the surface, tangentially, none is.
-    free = jnp.asarray(cuts.free)
+def _backwards(
+    curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, linear: Linear, events: Events, free: tuple[bool, ...]
+) -> tuple[Array, Array, Array]:
+    """Monodromy matrix, multipliers and stability of an orbit that slides on surfaces that repel.
+
+    Backwards in time such a surface attracts: what leaves it freely comes onto it there, and has a saltation matrix.
+    Where it comes onto the surface, tangentially, none is.
+    """
+    leaves = jnp.asarray(free)
+    # All but the last piece of a segment end in the middle of it.
+    onto = jnp.repeat(jnp.roll(leaves, -1), curve.pieces) & (itinerary.ends == EVENT)
+    smooth = itinerary._replace(ends=jnp.where(onto, PIECE, itinerary.ends))
+    factors = jnp.linalg.inv(factors_of(curve, smooth, u, linear.df, linear.closing))
     before, after = (
-        jnp.where(free[:, None], *pair)
+        jnp.where(leaves[:, None], *pair)
         for pair in ((events.mode_after, events.mode_before), (events.mode_before, events.mode_after))
     )
     swapped = eqx.tree_at(lambda e: (e.mode_before, e.mode_after), events, (before, after))
-    jumps = saltation_matrices(system, swapped)
-    tangent = jnp.roll(free, -1)
-    ordinary = happened & ~free & ~tangent
-    back = where(free, jumps, none)
-    back = where(ordinary, jnp.linalg.inv(where(ordinary, jumps, none)), back)
-    factors = jnp.concatenate([jnp.linalg.inv(phi), back[:, None]], axis=1).reshape(-1, *eye.shape)
-    infinite = jnp.asarray(sum(cuts.free), jnp.int32)
-    return *forwards(floquet(factors[::-1], infinite, autonomous), infinite, autonomous), zeros
+    jumps = jnp.where(leaves[:, None, None], saltation_matrices(curve.model.system, swapped), 0)
+    last = slice(curve.pieces - 1, None, curve.pieces)
+    factors = factors.at[last].set(jnp.where(leaves[:, None, None], factors[last] @ jumps, factors[last]))
+    infinite = jnp.asarray(sum(free), jnp.int32)
+    return forwards(floquet(factors[::-1], infinite, curve.autonomous), infinite, curve.autonomous)
 
 
-def _violation(system: System, cycle: _Cycle, begin: Array, end: Array, x: Array) -> tuple[Scalar, Scalar]:
+def _violation(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> tuple[Scalar, Scalar]:
     """By how much the guards of the modes are violated, and when: beyond what the tolerance makes of them."""
-    model, cuts, flows = SwitchedSystem.forwards(system, cycle.t0, cycle.y0), cycle.cuts, cycle.flows(system)
-    if not model.slots:
+    begin, end, x, value = curve.parts(u)
+    slots, n = len(curve.model.slots), x.shape[1]
+    if not slots:
         return jnp.zeros_like(begin[0]), begin[0]
-    starts = begin[:, None] + (end - begin)[:, None] * jnp.arange(cycle.pieces, dtype=end.dtype) / cycle.pieces
-    stops = jnp.concatenate([starts[:, 1:], end[:, None]], axis=1)
-
-    def piece(a: Scalar, b: Scalar, x: Array, within: ModeState, ending: ModeState) -> tuple[Array, Array, Array]:
-        def guards(t: Scalar, x: Array) -> list[list[Scalar]]:
-            return [row for state in (within, ending) for row in model.guards(t, cycle.unravel(x), state)]
-
-        # What is far from zero is of no interest.
-        found = flows.minima(a, b, x, within, guards, lambda most: 0.1 * most)
-        return found.least, found.most, a + found.share * (b - a)
-
-    rows = jax.vmap(jax.vmap(piece, (0, 0, 0, None, None)))
-    least, most, t = rows(starts, stops, x, cuts.within, cuts.ending)  # arcs, pieces, guards
-    size = jnp.max(jnp.maximum(jnp.abs(least), jnp.abs(most)), axis=(0, 1))
-    late = cuts.num < jnp.arange(len(begin), dtype=cuts.num.dtype)
-    short = jnp.where((least < -1e-7 * size) & ~late[:, None, None], -least, 0)
+    # As large as the orbit, so that what its dense output misses is known.
+    size = 1 + jnp.max(jnp.abs(x))
+    curve = dataclasses.replace(curve, sizes=curve.sizes * size, guard_sizes=curve.guard_sizes * size)
+    orders = jnp.zeros((2, 2 * n + slots), x.dtype)
+    segments = begin, end, x, itinerary.mode, itinerary.part
+    found = jax.vmap(lambda *segment: along_segment(curve, value, segment, orders, turns=False))(*segments)
+    least, most, share = (part[:, 2 * n :] for part in (found.least, found.most, found.share))
+    t = begin[:, None] + share * (end - begin)[:, None]
+    size = jnp.max(jnp.maximum(jnp.abs(least), jnp.abs(most)), axis=0)
+    late = jnp.arange(len(begin), dtype=itinerary.num.dtype) >= itinerary.num
+    short = jnp.where((least < -1e-7 * size) & ~late[:, None], -least, 0)
     worst = jnp.argmax(short)
     return short.ravel()[worst], t.ravel()[worst]

@@ -19,8 +19,8 @@ from ....flow._results import is_okay
 from ....orbits._find_orbit import find_orbit
 from ....orbits._orbit import Orbit
 from ....orbits.segments._equations import OrbitCurve
+from ....orbits.segments._guard_minima import extremes
 from ....orbits.segments._itinerary import capacity_for, OrbitItinerary, Start, starts_of
-from ....orbits.segments._point import extremes
 from ....sweeps._sweep import sweep
 from ....system._parameter import get_parameter, parameter_path, put_parameter
 from ....system._system import arrays_of, System

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ...._types import Scalar
+from ....orbits.segments._corrector import Plane
 from ....orbits.segments._equations import OrbitCurve
 from ....orbits.segments._itinerary import OrbitItinerary
-from ....orbits.segments._point import corrected, Plane, PointData
+from ....orbits.segments._point import corrected, PointData
 from ..._step_length import FIRST, next_length, SHORTEST, turn_between, TURNED
 from .._test_functions import BRANCH, branch_value, CIRCLE, circle_values, corner_tests, corner_values, PASSED, Test
 
