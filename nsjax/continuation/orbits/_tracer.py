@@ -10,7 +10,7 @@ import numpy as np
 from ..._numerics._bracket import bracketed
 from ...orbits.segments._corrector import Plane
 from ...orbits.segments._equations import OrbitCurve
-from ...orbits.segments._itinerary import EVENT, OrbitItinerary
+from ...orbits.segments._itinerary import OrbitItinerary, returning
 from ...orbits.segments._point import correct, PointData, state_at
 from .._step_length import FIRST, next_length, shortened, turn_between, TURNED
 from .._zeros import interpolated
@@ -181,13 +181,15 @@ class OrbitTracer:
         if len(trace.spots) >= self.max_points:
             return dataclasses.replace(trace, why=f"max_points = {self.max_points}, at {spot.parameter:.10g}")
 
+        back = returning(self.curve.model, spot.itinerary)
+
         def attempt(length: float) -> tuple[OrbitPoint, float, list[Zero]] | None:
             step = self.at(spot, length)
-            if step is not None and any(abs(step.look.end[i] - step.look.begin[i]) < ON for i in self.returns(spot)):
+            if step is None or any(abs(step.look.end[i] - step.look.begin[i]) < ON for i in back):
                 return None
-            turn = np.inf if step is None else float(turn_between(spot.look.tangent, step.look.tangent))
-            zeros = self.zeros(spot, step, length) if step is not None and turn <= TURNED else None
-            return None if step is None or zeros is None else (step, turn, zeros)
+            turn = float(turn_between(spot.look.tangent, step.look.tangent))
+            zeros = self.zeros(spot, step, length) if turn <= TURNED else None
+            return None if zeros is None else (step, turn, zeros)
 
         found = shortened(trace.length, attempt)
         if found is None:
@@ -317,8 +319,9 @@ class OrbitTracer:
         """By bracketing: the curve is smooth there, and so is the test function, except the least value of a guard."""
         seen: dict[float, OrbitPoint] = {0.0: spot, length: step}
         chord = step.look.u - spot.look.u
-        if test.kind == "duration" and test.row in self.returns(spot):
-            return self.vanishing(spot, step, length, test, scale)
+        if test.kind == "duration" and test.row in returning(self.curve.model, spot.itinerary):
+            begin, end = (test_values(self.curve, p, scale)[test] for p in (spot, step))
+            return self.interpolate(spot, length * begin / (begin - end), length, chord, scale, test)
 
         def at(s: float) -> OrbitPoint | None:
             return self.at(spot, s, spot.look.u + s / length * chord)
@@ -339,62 +342,35 @@ class OrbitTracer:
             return self.interpolate(spot, s, length, chord, scale, test)
         return Zero(s, test, seen[s])
 
-    def returns(self, spot: OrbitPoint) -> list[int]:
-        """The segments that leave a surface and end on it again. Each of them may stay there for no time at all, which
-        solves the equations too: where its duration vanishes the curve crosses that of such orbits, which are none."""
-        found, rows = [], list(spot.itinerary.rows)
-        for i in rows if self.curve.model.slots and len(rows) > 1 else []:
-            ends = self.curve.model.slots[int(spot.itinerary.slot[i])]
-            before = self.curve.model.slots[int(spot.itinerary.slot[i - 1 if i else rows[-1]])]
-            free = EVENT == spot.itinerary.ends[i] == spot.itinerary.ends[i - 1 if i else rows[-1]] and not ends.holding
-            if free and ends.switch == before.switch and (before.holding or ends.part == before.part):
-                found.append(i)
-        return found
-
-    def vanishing(self, spot: OrbitPoint, step: OrbitPoint, length: float, test: Test, scale: float) -> Zero | None:
-        """Where the duration of a segment vanishes that ends on the surface on which it began."""
+    def interpolate(
+        self, spot: OrbitPoint, s: float, length: float, chord: Any, scale: float, test: Test
+    ) -> Zero | None:
+        """A point at which the equations are singular, from points beside it. Where a duration vanishes, from points
+        so near at last that the polynomial has no error: orbits on which the segment has none anyway are none."""
+        found, place, along = None, spot.look.u + s / length * chord, chord / length
 
         def value(here: OrbitPoint) -> float:
-            found = self.value(here, test, scale)
-            if abs(found) < ON:
+            size = self.value(here, test, scale)
+            if test.kind == "duration" and abs(size) < ON:
                 raise ArithmeticError("this is an orbit on which the segment has no duration anyway")
-            return found
+            return size
 
-        begin, end = (test_values(self.curve, p, scale)[test] for p in (spot, step))
-        s, reach, chord = length * begin / (begin - end), 0.5 * length, step.look.u - spot.look.u
-        found, place = None, spot.look.u + s / length * chord
-        # At last from so near that the polynomial has no error, and with guesses that are the better for it.
-        for shorter in (1.0, 0.1):
+        for reach in (0.5, 0.05) if test.kind == "duration" else (0.5,):
 
-            def at(x: float, s: float = s, place: Any = place, along: Any = chord / length) -> OrbitPoint | None:
+            def at(x: float, s: float = s, place: Any = place, along: Any = along) -> OrbitPoint | None:
                 return self.at(spot, x, place + (x - s) * along)
 
             try:
-                found = interpolated(s, reach * shorter, at, value)
+                found = interpolated(s, reach * length, at, value)
             except ArithmeticError:
                 break
-            place, far = found.at(lambda here: here.look.u), found.points[-1].look.u
-            s, chord = found.s, (far - place) * (length / (reach * shorter))
+            s, place = found.s, found.at(lambda here: here.look.u)
+            along = found.points[-1].look.u - place
+            along = along / float(along @ spot.look.tangent)
         if found is None:
             return None
         look = correct(self.curve, spot.itinerary, Plane(place, spot.look.tangent), newton=False)
         return Zero(s, test, spot_of(self.curve, look, spot.itinerary))
-
-    def interpolate(
-        self, spot: OrbitPoint, s: float, length: float, chord: Any, scale: float, test: Test
-    ) -> Zero | None:
-        """A point at which the equations are singular, from points beside it."""
-
-        def at(s: float) -> OrbitPoint | None:
-            return self.at(spot, s, spot.look.u + s / length * chord)
-
-        try:
-            found = interpolated(s, 0.5 * length, at, lambda here: self.value(here, test, scale))
-        except ArithmeticError:
-            return None
-        plane = Plane(found.at(lambda here: here.look.u), spot.look.tangent)
-        look = correct(self.curve, spot.itinerary, plane, newton=False)
-        return Zero(found.s, test, spot_of(self.curve, look, spot.itinerary))
 
 
 def alike(a: OrbitPoint, b: OrbitPoint, curve: OrbitCurve, tolerance: float) -> bool:

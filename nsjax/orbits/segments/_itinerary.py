@@ -87,6 +87,18 @@ def slot_of(model: SwitchedSystem, k: int, holding: bool, part: int) -> int:
     return next(i for i, s in enumerate(model.slots) if (s.switch, s.holding, s.part) == (k, holding, part))
 
 
+def returning(model: SwitchedSystem, itinerary: OrbitItinerary) -> list[int]:
+    """The segments that leave a surface and end on it again. Each of them may stay there for no time at all, which
+    solves the equations too: where its duration vanishes the curve crosses that of such orbits, which are none."""
+    found, n = [], int(itinerary.num)
+    for i in range(n if model.slots and n > 1 else 0):
+        end, before = (model.slots[int(itinerary.slot[j])] for j in (i, i - 1 if i else n - 1))
+        free = itinerary.ends[i] == itinerary.ends[i - 1 if i else n - 1] == EVENT and not end.holding
+        if free and end.switch == before.switch and (before.holding or end.part == before.part):
+            found.append(i)
+    return found
+
+
 def nearest_parts(model: SwitchedSystem, t: Scalar, y: Y) -> Int[Array, " switches"]:
     """The component of every h that is nearest to zero."""
     each = [model.h(k, t, y) for k in range(len(model.switches))]
