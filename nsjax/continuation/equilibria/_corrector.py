@@ -209,9 +209,9 @@ def row_sizes(curve: Curve, u: Array, mode: Array) -> Array:
     """Of the rows of DF: what they have, or would have a unit further on, where all of a row vanishes here."""
     first = jax.jacfwd(curve.residual)
     df, bends = first(u, mode), jax.jacfwd(first)(u, mode)
-    # What an equation fixes by itself does not vary: as the value of a switch on one side of its surface. (In the
-    # middle of a rotor's stator the field of contact has no derivative; but there is no contact.)
-    alone = (df != 0) & (jnp.sum(df != 0, axis=1, keepdims=True) == 1)
+    # What a linear equation fixes by itself does not vary: as the value of a switch on one side of its surface. (In
+    # the middle of a rotor's stator the field of contact has no derivative; but there is no contact.)
+    alone = (df != 0) & (jnp.sum(df != 0, axis=1, keepdims=True) == 1) & ~jnp.any(bends, axis=(1, 2))[:, None]
     varies = ~jnp.any(alone, axis=0)
     bends = jnp.where(varies[:, None] & varies[None, :], bends, 0)
     size = jnp.max(jnp.abs(df), axis=1) + jnp.max(jnp.abs(bends), axis=(1, 2))
