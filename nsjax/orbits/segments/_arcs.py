@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..._numerics._autodiff import dense_jacobian
 from ..._numerics._compile import interactive
 from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, THETA
 from ..._numerics._text import between, shown, written
@@ -96,12 +95,6 @@ class Flows(eqx.Module):
 
         return jax.vmap(row)(begin, end, x, self.within)
 
-    def ends(self, begin: Array, end: Array, x: Array) -> Float[Array, "rows pieces n"]:
-        def last(flows: Flows, a: Scalar, b: Scalar, x: Array, state: ModeState) -> Array:
-            return flows.piece(a, b, x, state, dfx.SaveAt(t1=True))[0]
-
-        return self.rows(lambda *args: dense_jacobian(last, self, *args), begin, end, x)
-
     def paths(self, begin: Array, end: Array, x: Array, samples: int = SAMPLES) -> tuple[Array, Array]:
         """Times and states along every arc."""
 
@@ -138,32 +131,6 @@ class Flows(eqx.Module):
         places = places_of(jax.eval_shape(functions, a, x))
         orders = jnp.zeros((2, len(places)), x.dtype)
         return in_order(minima(sample, groups, x, orders, below), places)
-
-    def derivatives(self, begin: Array, end: Array, x: Array) -> tuple[Array, Float[Array, "rows pieces n n"]]:
-        """The ends of all pieces, and their derivatives by the beginnings."""
-
-        def one(a: Scalar, b: Scalar, x: Array, state: ModeState) -> tuple[Array, Array]:
-            def last(x: Array) -> tuple[Array, Array]:
-                (end,) = self.piece(a, b, x, state, dfx.SaveAt(t1=True))
-                return end, end
-
-            phi, end = jax.jacfwd(last, has_aux=True)(x)
-            return end, phi
-
-        return self.rows(one, begin, end, x)
-
-    def at(self, times: Array, begin: Array, end: Array, x: Array) -> Float[Array, "times n"]:
-        """States at given times of the orbit."""
-        starts = (
-            begin[:, None] + (end - begin)[:, None] * jnp.arange(self.pieces, dtype=end.dtype) / self.pieces
-        ).ravel()
-
-        def one(t: Scalar) -> Array:
-            i = jnp.maximum(jnp.searchsorted(starts, t, side="right") - 1, 0)
-            state = jax.tree.map(lambda s: s[i // self.pieces], self.within)
-            return self.piece(starts[i], t, x.reshape(-1, x.shape[-1])[i], state, dfx.SaveAt(t1=True))[0]
-
-        return jax.vmap(one)(times)
 
 
 def _spread(tolerance: Any, y: Y) -> Y:
