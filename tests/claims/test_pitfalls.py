@@ -183,6 +183,7 @@ def test_many_blocks(start, n):
     np.testing.assert_allclose(energy(sol.y1), energy(y0), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_blocks_cost_no_combinations():
     """No 3^m, and nothing else that grows faster than their number: blocks that act on no other's surface are solved
     for, and their modes chosen, apart."""

@@ -119,7 +119,8 @@ def test_fold_beside_a_corner(less, max_step):
     assert ends == [False, True] and branch.values[[0, -1]] == pytest.approx(float(known.corner) + 0.5)
 
 
-@pytest.mark.parametrize("less, max_step", [pytest.param(0.1, 0.02, marks=pytest.mark.slow), (0.1, 0.2), (0.01, 0.02)])
+@pytest.mark.slow
+@pytest.mark.parametrize("less, max_step", [(0.1, 0.02), (0.1, 0.2), (0.01, 0.02)])
 def test_flip_beside_a_corner(less, max_step):
     """Pitfall 25: the flip is 8e-4 and 9e-6 away from it."""
     branch, known = bumper(0.727, -1, less, max_step=max_step)
@@ -297,6 +298,7 @@ def test_start_that_sticks():
     assert branch.ends == ("omega = 0.4", "omega = 0.6")
 
 
+@pytest.mark.slow
 def test_end_in_a_continuum():
     """Below A = 1 friction holds the mass for ever, at every |x| < 1 - A (issue 20.12)."""
 

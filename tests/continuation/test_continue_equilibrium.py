@@ -491,6 +491,7 @@ class Forms(nsjax.System):
         return jnp.concatenate([rate(y[:n], self.mu - self.m), rate(y[n:], self.mu - self.m - self.d)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pitchfork", "transcritical", "Hopf"])
 def test_wherever_in_the_interval(kind):
     """Places that steps end on, that bisection hits exactly, and where rows of the equations vanish in all digits."""
@@ -667,6 +668,7 @@ def test_orbits_born_at_a_discontinuous_hopf_point():
     assert told.orbits == (0, 1) and told.criticality == "supercritical" and told.evidence == "both"
 
 
+@pytest.mark.slow
 def test_parameter_of_a_system_within():
     """`smoothed(system)` is continued over the parameter of `system`: (5.40) again."""
     system = nsjax.smoothed(gallery.HopfPitchfork(-1.0), 10.0)

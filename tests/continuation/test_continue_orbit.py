@@ -97,6 +97,7 @@ def test_symmetry_breaking(friction):
     assert sum(abs(s.value - c.value) < 1e-8 for s in friction.others[0].special) == 2
 
 
+@pytest.mark.slow
 def test_from_the_branch_that_broke_the_symmetry(friction):
     """At B one place has its stick phase vanish while at the other one is about to begin."""
     system = gallery.ForcedFriction(omega=0.65)
@@ -279,6 +280,7 @@ def squash(a, L, e):
     return t, (L - a * np.sin(t)) * (1 + 1 / e) / (2 * np.pi)
 
 
+@pytest.mark.slow
 def test_the_wall_that_is_hit():
     """An impact with several surfaces, one of which moves: each acts where it is hit, not where it is left."""
     a, e = 0.3, 0.8

@@ -114,6 +114,7 @@ def test_two_zeros_in_one_step(duffing):
         np.testing.assert_allclose(found, want, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_from_several_orbits(duffing):
     """At nearly one parameter: the lower, the unstable and the upper orbit lie on one branch."""
     _, branches = duffing
@@ -129,6 +130,7 @@ def test_from_several_orbits(duffing):
         np.testing.assert_allclose(sorted(again.values[i][again.kinds[i] == "fold"]), folds, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_budget(walls):
     orbits, branches = walls
     few = continue_orbits(orbits, "omega", (0.1, 1.5), points=5)

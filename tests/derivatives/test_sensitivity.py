@@ -44,6 +44,7 @@ def test_a_walk_over_a_grazing_is_seen():
     assert not grazing.defined and grazing.result == RESULTS.tangential_event
 
 
+@pytest.mark.slow
 def test_itineraries_of_many():
     """In a batch, and with logs of different sizes."""
 
@@ -60,6 +61,7 @@ def test_itineraries_of_many():
         other.same_as(many)
 
 
+@pytest.mark.slow
 def test_reverse():
     """By `reverse=True`, for a scalar of many parameters."""
 

@@ -148,6 +148,7 @@ def test_elements_that_move_as_one(name):
     np.testing.assert_allclose([sol.y1.x, sol.y1.v], want.y1, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_shares():
     """While they stick λ_i = θ b_i, each in the direction in which it resists: ∫λ_i dt over a stick phase, here from
     x = -1 to 1 with θ = -x / ΣF b, and the same whatever the order of declaration."""
@@ -174,7 +175,8 @@ def test_other_methods(solver):
     np.testing.assert_allclose([sol.y1.x, sol.y1.v], flat(want.y1), atol=1e-6)
 
 
-@pytest.mark.parametrize("where", [pytest.param("slipping", marks=pytest.mark.slow), "sticking"])
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["slipping", "sticking"])
 def test_derivatives_through_sticking(where):
     """By parameters, strengths and start: those of the one element, and numbers."""
     x, v = STARTS[where]
@@ -196,7 +198,8 @@ def test_derivatives_through_sticking(where):
     np.testing.assert_allclose(got[:, 8:], 0, atol=1e-6)  # the units of the surfaces
 
 
-@pytest.mark.parametrize("tuples", [*(pytest.param(t, marks=pytest.mark.slow) for t in ((0,), (1,))), (0, 1)])
+@pytest.mark.slow
+@pytest.mark.parametrize("tuples", [(0,), (1,), (0, 1)])
 def test_one_component_of_a_corner(tuples):
     """The surfaces coincide where a certain component of a tuple is the least."""
     many, one = group("static", tuples=tuples)

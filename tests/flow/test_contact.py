@@ -406,7 +406,7 @@ def test_start_by_mode():
         solve(Glue(), 0.0, 1.0, Motion(1.0, 0.0))
 
 
-@pytest.mark.parametrize("mu", [0.3, 1.5])
+@pytest.mark.parametrize("mu", [0.3, pytest.param(1.5, marks=pytest.mark.slow)])
 def test_friction_of_an_open_contact(mu):
     """Pitfall 43: in flight there is no friction, so that the sliding velocity passes through zero and does not stick;
     on the floor there is, and the impact takes its share of it."""

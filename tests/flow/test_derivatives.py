@@ -251,6 +251,7 @@ def test_two_surfaces():
     np.testing.assert_allclose(found[0], want, atol=1e-9 * np.abs(want).max())
 
 
+@pytest.mark.slow
 def test_saved_states_within_a_step_to_an_event():
     """Pitfall 19: the derivative of a state saved on such a step is that of a solution which ends there."""
     ts = jnp.array([1.0, 3.6, 12.0, 13.2])  # in slip; on the one long step of stick, up to its end at 13.27

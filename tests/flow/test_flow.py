@@ -405,6 +405,7 @@ def test_impacts_flip_friction_and_relay(puck):
             assert e.mode_after["rub"] == -e.mode_before["rub"] != 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("t_c", [0.8, 10 - np.sqrt(80)])
 def test_clock_and_wall_in_one_step(t_c):
     """Pitfall 12: the clock strikes on the step that would meet the wall, shortly before the wall or with it."""
@@ -416,7 +417,8 @@ def test_clock_and_wall_in_one_step(t_c):
     np.testing.assert_allclose(clock, [t_c], atol=1e-12)
 
 
-@pytest.mark.parametrize("order", [(4, 3, 2, 1, 0), pytest.param((2, 0, 4, 1, 3), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [(4, 3, 2, 1, 0), (2, 0, 4, 1, 3)])
 def test_order_of_declaration_does_not_matter(puck, order):
     """Pitfall 32."""
     sol = solve(Bumper(order=order), 0.0, 4.0, Puck(0.0, 1.0, 0.0), stepsize_controller=pid(1e-10))

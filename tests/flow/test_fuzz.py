@@ -56,10 +56,10 @@ def fuzz(name: str, number: int, seed: int, derive: bool) -> tuple[collections.C
     return count(truths, Solved(*out), (name, seed))
 
 
-QUICK = ("friction", "corners", "relays")
+QUICK = ("friction", "relays")
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", [*QUICK, pytest.param("corners", marks=pytest.mark.slow)])
 def test_random_systems(name):
     tally, wrong = fuzz(name, 80, 0, derive=name == "friction")
     assert not wrong

@@ -88,7 +88,8 @@ def fuzz(name: str, number: int, seed: int) -> tuple[collections.Counter, list]:
     return count(truths, jax.tree.map(np.asarray, run(batch, shape, solver)), (name, seed))
 
 
-@pytest.mark.parametrize("name", ["one", pytest.param("two", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["one", "two"])
 def test_random_curved_systems(name):
     tally, wrong = fuzz(name, 50, 0)
     assert not wrong

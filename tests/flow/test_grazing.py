@@ -68,7 +68,7 @@ def test_square_root_is_not_floored():
     np.testing.assert_allclose(slopes, 1.5 / np.sqrt(2) * np.cos(3), rtol=2e-2)
 
 
-@pytest.mark.parametrize("method", ["variational", "autodiff"])
+@pytest.mark.parametrize("method", ["variational", pytest.param("autodiff", marks=pytest.mark.slow)])
 def test_fundamental_matrix_through_grazing(method):
     """Issue 20.5: not defined beyond a tangential event, and said so; defined before it."""
     args = dict(method=method, solver=dfx.Tsit5(), stepsize_controller=pid(1e-12))

@@ -136,6 +136,7 @@ def test_an_impact_without_sliding(lean, u):
     assert sol.mode1.tolist() == [0, OFF]
 
 
+@pytest.mark.slow
 def test_it_starts_as_its_contact_does():
     """Open, closed, with what an earlier solution ended in, and in one batch."""
     high, low = Plane(0.0, 0.2, 0.0, 0.0), Plane(0.0, 0.0, 0.0, 0.0)
@@ -200,6 +201,7 @@ def followed(m, t1, y0):
     return y
 
 
+@pytest.mark.slow
 def test_on_a_soft_floor_as_scipy_has_it():
     """Bounces, with slip of both signs and stick: the floor lets go where its force vanishes."""
     y0, t1 = (0.6, 0.3, 1.5, 0.0), 20.0
@@ -212,6 +214,7 @@ def test_on_a_soft_floor_as_scipy_has_it():
     assert (switches[:-1][open_[:-1]] == 0).all() and (switches[1:][open_[:-1]] == 0).all()
 
 
+@pytest.mark.slow
 def test_orbit_and_derivative():
     """The orbit that the solution settles to, and its monodromy matrix, against differences of the period map."""
     m = Soft(c=8.0)

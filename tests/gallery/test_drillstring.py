@@ -143,6 +143,7 @@ def test_a_scene_costs_what_the_same_written_by_hand_costs():
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_rotor_that_does_not_touch_its_stator_has_no_events():
     """Friction is there only in contact: turning the other way over v_rel = 0 is no event."""
     system = gallery.thesis("A.7", omega=0.1)
@@ -194,6 +195,7 @@ def point_d():
         return float(found[0]), float(found[1])
 
 
+@pytest.mark.slow
 def test_equilibria_of_whirl():
     """Fig. A.6: from e2 over f to e3, over d to e4, both discontinuous saddle-nodes."""
     system = gallery.thesis("A.7", omega=2.64)

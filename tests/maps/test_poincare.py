@@ -104,6 +104,7 @@ def orbit():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_derivative_is_6_7(orbit):
     """On a section through an orbit, not perpendicular to it; by the flow's derivatives, by (6.7), and by finite
     differences. The return time's derivative is the row that (6.7) projects out, -nᵀΦ / (nᵀf)."""
@@ -261,6 +262,7 @@ def support(t, y):
     return y.x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("section", ["support", support])
 def test_a_surface_through_the_origin_is_a_section(section):
     """Pitfall 3: rounding of the state at the event is more than that of h itself, and iterates go on all the same.
@@ -343,7 +345,7 @@ def phase(t, y):
     return jnp.sin(0.8 * t)
 
 
-@pytest.mark.parametrize("e, b", [(0.8, 0.0), (0.0, -2.0)])
+@pytest.mark.parametrize("e, b", [pytest.param(0.8, 0.0, marks=pytest.mark.slow), (0.0, -2.0)])
 def test_a_phase_of_the_forcing_is_a_section(e, b):
     """Also of a mass that rests on the wall all the time, in its mode."""
     system, y0 = ForcedHammer(e=e, b=b), Motion(1.0, 0.0)

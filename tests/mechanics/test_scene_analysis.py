@@ -53,6 +53,7 @@ class Blocks(SceneModel):
         return Scene({"x1": self.m, "x2": self.m}, **ties, **belts, spring=Spring({"x1": 1, "x2": -1}, k=self.k))
 
 
+@pytest.mark.slow
 def test_a_model_may_be_built_as_a_scene():
     """Derivatives by a number that enters several effects are the sums of those by each."""
     blocks = Blocks()

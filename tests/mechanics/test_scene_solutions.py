@@ -43,6 +43,7 @@ def test_a_scene_moves_as_the_model_by_hand(name):
     assert len(events) >= 2
 
 
+@pytest.mark.slow
 def test_derivatives_by_a_parameter_of_an_effect():
     """By the velocity of the belt, through stick and slip, as by the field of the model written by hand."""
 

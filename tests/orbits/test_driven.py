@@ -97,6 +97,7 @@ class Powers(nsjax.System):
         return 2 * jnp.pi / 1.3
 
 
+@pytest.mark.slow
 def test_a_parameter_by_which_nothing_can_be_differentiated():
     """Zero times an infinite derivative is not a number; the derivative by the state is one."""
     start = Motion(0.1, 0.1)

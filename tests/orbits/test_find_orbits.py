@@ -23,6 +23,7 @@ class Rings(nsjax.System):
         return Motion(growth * y.x - y.v, growth * y.v + y.x)
 
 
+@pytest.mark.slow
 def test_rings():
     """Whatever the base points, each ring is found once; the focus is none."""
     angle = jnp.arange(12.0)

@@ -149,7 +149,9 @@ def test_solution_over_several_periods(classic):
         ),
         (dict(c=0.1), (2.0, 0.0), 2 * 12.6352, RESULTS.orbit_is_multiple_cover),
         (dict(), (2.02, 0.0), 3 * 13.536, RESULTS.orbit_is_multiple_cover),
-        (dict(c=0.1, v_dr=2.0), (2.0, 0.0), 12.6, RESULTS.orbit_is_equilibrium),  # beyond the fold of Fig. 6.15
+        pytest.param(  # beyond the fold of Fig. 6.15
+            dict(c=0.1, v_dr=2.0), (2.0, 0.0), 12.6, RESULTS.orbit_is_equilibrium, marks=pytest.mark.slow
+        ),
     ],
 )
 def test_not_the_orbit_asked_for(parameters, y0, period, result):
@@ -317,6 +319,7 @@ def test_maximum_of_many_peaks():
     np.testing.assert_allclose(orbit.maximum(lambda t, y: 0 * y.x + 2), 2, rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_maximum_of_an_orbit_that_sticks(classic):
     """1 + √(1 + v²) in slip, at a state that Fig. 3.7 begins with; v_dr in stick, where it is not one place alone."""
     np.testing.assert_allclose(classic.maximum(lambda t, y: y.x), 1 + np.hypot(1, 0.2), rtol=1e-11)
@@ -515,6 +518,7 @@ class Thermostat(nsjax.System):
         return y - 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heat", [1.5, 3.0])
 @pytest.mark.parametrize("period", [None, 0.5])
 def test_an_orbit_within_the_hysteresis(heat, period):
@@ -549,7 +553,7 @@ class Driven(Held):
 
 @pytest.mark.parametrize(
     "system, guess",
-    [(Held(), {}), (Held(), dict(period=6.0)), (Driven(), {})],
+    [(Held(), {}), (Held(), dict(period=6.0)), pytest.param(Driven(), {}, marks=pytest.mark.slow)],
     ids=["free", "period", "forced"],
 )
 @pytest.mark.parametrize(

@@ -51,6 +51,7 @@ def test_infinitely_unstable(v_dr):
     assert "multipliers  inf" in str(orbit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("v_dr", [0.2, 0.5, 1.0])
 def test_backward_shooting(v_dr):
     """The same orbits, from nothing but a start beside them and a period, in backward time."""
@@ -96,6 +97,7 @@ def test_derivative_of_backward_shooting():
     np.testing.assert_allclose(jacobian, [[0, exact[2]], [(x - 1) / 0.5, exact[1]]], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_derivative_of_an_unstable_orbit():
     """Its period does not depend on v_dr, and x where it leaves the belt does so linearly: there is one scale."""
 

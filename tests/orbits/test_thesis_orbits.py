@@ -124,6 +124,7 @@ def test_order_is_found_out():
     assert len(free.events) == 0
 
 
+@pytest.mark.slow
 def test_grazing():
     """Pitfall 10: the linear orbit's amplitude is just the gap. By segments, with an impact of velocity zero, that is
     well-posed: the Jacobian of the equations is regular, and only the monodromy matrix does not exist."""

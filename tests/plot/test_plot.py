@@ -267,6 +267,7 @@ def test_perturbation_tube_takes_axes_and_components():
     np.testing.assert_allclose(np.ptp(drawn(ax, "perturbations"), axis=0), extent / 10, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_mistakes_with_a_tube_are_named():
     with pytest.raises(ValueError, match="leaves a surface that repels"):
         plot.perturbation_tube(infinitely_unstable())
@@ -339,6 +340,7 @@ def test_bifurcation_diagram():
     assert [text.get_text() for text in ax.texts] == ["Hopf,\nsupercritical"]
 
 
+@pytest.mark.slow
 def test_bifurcation_diagram_of_a_function():
     start = gallery.Line(0.0)
     branch = nsjax.continue_equilibrium(gallery.DiscontinuousPitchfork(-1.0), start, "mu", (-1.0, 1.0))

@@ -201,7 +201,8 @@ class Table(nsjax.System):
         return self.e
 
 
-@pytest.mark.parametrize("name, bound", [pytest.param("banded", 1e-7, marks=SLOW), ("linear", 1e-3)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name, bound", [("banded", 1e-7), ("linear", 1e-3)])
 def test_contact_beside_friction(name, bound):
     """Impacts, their accumulation and the resting contact remain events; friction is none any more."""
     y0 = Skid(0.5, 0.0, 1.0)
@@ -325,6 +326,7 @@ class Bend(nsjax.System):
         return y.x**2 + y.y**2 - self.r
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "dtype, bounds", [(jnp.float64, (1e-14, 1e-12, 1e-9)), pytest.param(jnp.float32, (1e-5, 1e-4, 1e-3), marks=SLOW)]
 )
