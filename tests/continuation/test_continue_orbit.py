@@ -294,3 +294,20 @@ def test_the_wall_that_is_hit():
     np.testing.assert_allclose(branch.high.v, want, rtol=1e-9)
     np.testing.assert_allclose(branch.low.v, -e * want, rtol=1e-9)
     assert list(branch.values[[0, -1]]) == pytest.approx([0.8, 1.2]) and not branch.special_points
+
+
+@pytest.mark.parametrize("alpha, criticality", [(-1.0, "supercritical"), (1.0, "subcritical")])
+def test_a_branch_shrinks_to_a_hopf_point(alpha, criticality):
+    """(5.25): r = √(-μ/α), period 2π/(ω + β r²). The parameter is even in the size, but the orbits do not turn back."""
+    system = gallery.Hopf(mu=-0.8 * alpha, alpha=alpha)
+    orbit = nsjax.find_orbit(system, gallery.Plane(0.894, 0.0), period=2 * np.pi / 1.8)
+    branch = continue_orbit(system, orbit, "mu", (-1.0, 1.0))
+    (hopf,) = branch.special_points
+    assert hopf.name == f"Hopf bifurcation, {criticality}" and not branch.others
+    assert hopf.count == (((), (1,)) if alpha < 0 else ((1,), ()))
+    np.testing.assert_allclose([hopf.value, hopf.period, *hopf.y], [0, 2 * np.pi, 0, 0], atol=1e-13)
+    at = branch.indices[0]
+    assert at in (0, len(branch) - 1) and branch.values[at] == hopf.value
+    assert branch.stable.all() if alpha < 0 else not branch.stable.any()
+    np.testing.assert_allclose(branch.high.x1, np.sqrt(np.abs(branch.values)), atol=1e-6)
+    np.testing.assert_allclose(branch.periods, 2 * np.pi / (1 - branch.values / alpha), rtol=1e-9)

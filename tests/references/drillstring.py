@@ -1,4 +1,10 @@
-"""The drillstring of Appendix A in the complex plane, z = x + iy: for numbers of any kind, those of mpmath too."""
+"""The drillstring of Appendix A in the complex plane, z = x + iy: for numbers of any kind, those of mpmath too;
+and its periodic orbits by scipy."""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.optimize import root
+
 
 # Appendix C.6.
 M = M_F = K = R_C = J = K_PHI = 1.0
@@ -34,3 +40,100 @@ def regions(r, u, Omega, phi, w, omega):
     """The values of the switches in the region of a state."""
     theta, pushes = omega + w, r > R_C and K_B * (r - R_C) + C_B * u > 0
     return (1 if pushes else -1), (1 if r * Omega + R * theta > 0 else -1), (1 if theta > 0 else -1)
+
+
+# Periodic orbits, arc by arc: scipy, with the variational equations and saltation matrices.
+
+CONTACT, RELEASE, STOP, SLIP = "contact", "release", "stop", "slip"  # what ends an arc
+
+
+def field(y, omega, s):
+    """(A.51), and while the bit sticks its angular velocity stays what it is."""
+    f = np.array(drillstring(*y, omega, s))
+    if s[2] == 0:
+        f[4] = 0.0
+    return f
+
+
+def ending(event, y, omega, s):
+    """What comes down to zero at the end of an arc."""
+    r, u, _, _, w = y
+    if event == CONTACT:
+        return R_C - r
+    if event == RELEASE:
+        return K_B * (r - R_C) + C_B * u
+    if event == STOP:
+        return omega + w
+    torque = drillstring(*y, omega, (*s[:2], 0))[4] * J  # what friction has to balance: at most T_0
+    return T_0 - torque
+
+
+def slope(of, y, step=1e-6):
+    """Derivative by the state, by central differences of fourth order."""
+    columns = []
+    for e in np.eye(len(y)):
+        near, far = (of(y + h * e) - of(y - h * e) for h in (step, 2 * step))
+        columns.append((8 * near - far) / (12 * step))
+    return np.array(columns).T
+
+
+def lap(y, time, omega, arcs):
+    """The state after a time, and its derivative by the first one.
+
+    - `arcs`: values of the switches and the event that ends each arc; the last one ends with the time.
+    """
+    n, t, phi = len(y), 0.0, np.eye(len(y))
+    for k, (s, event) in enumerate(arcs):
+
+        def both(t, z, s=s):
+            y, phi = z[:n], z[n:].reshape(n, n)
+            return np.append(field(y, omega, s), slope(lambda y: field(y, omega, s), y) @ phi)
+
+        def over(t, z, s=s, event=event):
+            return ending(event, z[:n], omega, s)
+
+        over.terminal, over.direction = True, -1
+        start = np.append(y, phi)
+        events = None if event is None else over
+        arc = solve_ivp(both, (t, time), start, "DOP853", events=events, rtol=1e-12, atol=1e-13)
+        if event is not None and arc.status != 1:
+            raise ArithmeticError(f"no {event} before t = {time}")
+        t, y, phi = arc.t[-1], arc.y[:n, -1], arc.y[n:, -1].reshape(n, n)
+        if event is not None:
+            normal = slope(lambda y, e=event, s=s: ending(e, y, omega, s), y)
+            before, after = field(y, omega, s), field(y, omega, arcs[k + 1][0])
+            salt = np.eye(n) + np.outer(after - before, normal) / (normal @ before)
+            if event == STOP and arcs[k + 1][0][2] == 0:
+                salt = (np.eye(n) - np.outer(np.eye(n)[4], np.eye(n)[4])) @ salt  # w = -ω from now on
+            phi = salt @ phi
+    return y, phi
+
+
+def of_fold(monodromy):
+    """Zero where a second multiplier is 1: derivative at 1 of the characteristic polynomial."""
+    return np.polyval(np.polyder(np.poly(monodromy)), 1.0)
+
+
+def of_flip(monodromy):
+    return np.linalg.det(monodromy + np.eye(len(monodromy)))
+
+
+def of_neimark_sacker(monodromy):
+    """Zero where a pair has modulus one: the largest one off the real axis."""
+    rho = np.linalg.eigvals(monodromy)
+    return np.max(np.abs(rho[np.abs(rho.imag) > 1e-3])) - 1
+
+
+def special_point(y, time, omega, arcs, test):
+    """The orbit near a given one at which a test function of its monodromy matrix is zero: state, period, parameter,
+    multipliers. The state is sought at right angles to the flow through the given one."""
+    y = np.array(y, float)
+    along = field(y, omega, arcs[0][0])
+
+    def residual(z):
+        end, phi = lap(z[:5], z[5], z[6], arcs)
+        return np.concatenate([end - z[:5], [along @ (z[:5] - y), test(phi)]])
+
+    found = root(residual, np.concatenate([y, [time, omega]]), method="hybr", options=dict(xtol=1e-12, eps=1e-14))
+    z = found.x
+    return z[:5], z[5], z[6], np.linalg.eigvals(lap(z[:5], z[5], z[6], arcs)[1])

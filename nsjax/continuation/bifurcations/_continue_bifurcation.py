@@ -200,6 +200,11 @@ def _checked(
 ) -> tuple[Origin, tuple[str, ...], np.ndarray, np.ndarray]:
     """Where the curve sets out, the second parameter, and the ends of both intervals."""
     origin = special.origin
+    if origin is None and special.kind == "Hopf":
+        raise ValueError(
+            "Argument `special` must be a bifurcation of periodic orbits, but at this Hopf bifurcation they shrink to "
+            "an equilibrium."
+        )
     if origin is None:
         raise ValueError(
             "Argument `special` must come from `continue_orbit` itself, but was loaded from a file, which does not "

@@ -63,7 +63,8 @@ class OrbitBifurcation(AbstractSpecialPoint):
 
     **Attributes:**
 
-    - `kind`: "fold", "flip", "Neimark-Sacker", "symmetry breaking", "transcritical"; "fold-flip" where set-valued
+    - `kind`: "fold", "flip", "Neimark-Sacker", "symmetry breaking", "transcritical"; "Hopf" where the orbits shrink to
+        an equilibrium (the period and the multipliers are those of its linearisation); "fold-flip" where set-valued
         multipliers cross the circle at both 1 and -1 (section 6.9); "infinitely unstable fold" where one jumps from 0
         to infinity (section 6.7); "multiple crossing", or "3 to 1" (the numbers below and above) for what has no
         name; "none" where the itinerary changes without a bifurcation; "end" where there is no orbit nearby beyond,
@@ -84,7 +85,7 @@ class OrbitBifurcation(AbstractSpecialPoint):
     - `monodromies`: the matrices that belong to them: the ends of the set-valued one (6.13).
     - `crossings`: of the unit circle on the way from one to the other.
     - `halves`: the half-branches that meet there.
-    - `origin`: what `continue_bifurcation` sets out from; None if the point was loaded.
+    - `origin`: what `continue_bifurcation` sets out from; None at a Hopf bifurcation, or if the point was loaded.
     """
 
     plain = {"end": "end of the branch", "continuum": "end of the branch in a continuum of orbits"}
@@ -188,6 +189,17 @@ class OrbitBifurcation(AbstractSpecialPoint):
             count=(below, above), surfaces=surfaces, crossings=[], halves=halves,
             multipliers=(halves[0].multipliers, halves[1].multipliers),
             monodromies=(spot.monodromy, np.full_like(spot.monodromy, np.inf)), **_common(name, spot, curve),
+        )  # fmt: skip
+
+    @classmethod
+    def hopf(cls, name: str, spot: Any, curve: Any, side: int, criticality: str) -> "OrbitBifurcation":
+        """Where the orbits on one side shrink to an equilibrium."""
+        below, above = (((1,) if side == s else ()) for s in (-1, 1))
+        return cls(
+            kind="Hopf", discontinuous=False, criticality=criticality, evidence="both", by_count="Hopf",
+            by_crossing=("Hopf",), transition=None, count=(below, above), surfaces=(), crossings=[], halves=[],
+            multipliers=(spot.multipliers, spot.multipliers), monodromies=(spot.monodromy, spot.monodromy),
+            **_common(name, spot, curve),
         )  # fmt: skip
 
     @classmethod

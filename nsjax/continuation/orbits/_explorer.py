@@ -11,6 +11,7 @@ from ..equilibria._branch import CLOSED
 from ._bifurcation import OrbitBifurcation
 from ._branch import OrbitBranchSegment, Point
 from ._branch_switching import admissible, Departure, Node, tracer_for
+from ._hopf_end import hopf_end
 from ._record import Recorder
 from ._test_functions import CORNERS, PASSED
 from ._tracer import alike, LAST_FOUND, OrbitPoint, OrbitTracer, SAME, Trace, turned
@@ -126,6 +127,12 @@ class OrbitExplorer:
             return tree, None
         spot = trace.spots[-1]
         piece = tree.piece.then(self.point(spot, walk.curve, not walk.virtual or admissible(walk.curve, spot)))
+        if trace.at is not None and trace.at.test.kind == "fold":
+            hopf = hopf_end(self.name, walk.curve, trace)
+            if hopf is not None:
+                last, made = hopf
+                piece = piece.ending(self.point(last, walk.curve)).noting(made)
+                return self.end(tree.growing(piece), f"{made.name} at {self.name} = {made.value:.6g}"), last
         if trace.at is not None and trace.at.test.kind in PASSED:
             tree, made = self.passed(tree, tracer, trace)
             piece = piece if made is None else piece.noting(made)
