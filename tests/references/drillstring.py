@@ -77,10 +77,11 @@ def slope(of, y, step=1e-6):
     return np.array(columns).T
 
 
-def lap(y, time, omega, arcs):
+def lap(y, time, omega, arcs, field=field, ending=ending):
     """The state after a time, and its derivative by the first one.
 
     - `arcs`: values of the switches and the event that ends each arc; the last one ends with the time.
+    - `field`, `ending`: the equations, and what ends an arc.
     """
     n, t, phi = len(y), 0.0, np.eye(len(y))
     for k, (s, event) in enumerate(arcs):

@@ -11,7 +11,7 @@ from ..equilibria._branch import CLOSED
 from ._bifurcation import OrbitBifurcation
 from ._branch import OrbitBranchSegment, Point
 from ._branch_switching import admissible, Departure, Node, tracer_for
-from ._hopf_end import hopf_end
+from ._collapse import hopf_end, limits
 from ._record import Recorder
 from ._test_functions import CORNERS, PASSED
 from ._tracer import alike, LAST_FOUND, OrbitPoint, OrbitTracer, SAME, Trace, turned
@@ -168,7 +168,7 @@ class OrbitExplorer:
             return self.end(tree, why)
         if zero.test.kind in ("low", "high"):
             return self.end(tree, f"{self.name} = {zero.spot.parameter:.6g}")
-        zero = exactly(tracer, zero) or zero
+        zero = limits(tracer, trace, exactly(tracer, zero) or zero)
         at = next((i for i, node in enumerate(tree.nodes) if node.is_at(zero, walk.curve)), len(tree.nodes))
         if at == len(tree.nodes):
             node = node_at(tracer, self.name, zero, max(1, self.max_order // order))

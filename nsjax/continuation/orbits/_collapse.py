@@ -1,4 +1,4 @@
-"""Where a branch of periodic orbits shrinks to an equilibrium: a Hopf bifurcation."""
+"""Where a branch of periodic orbits shrinks to an equilibrium: at a Hopf bifurcation, or at a corner."""
 
 import dataclasses
 from typing import NamedTuple
@@ -14,11 +14,13 @@ from ...flow._results import is_okay
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import TIME
 from ._bifurcation import OrbitBifurcation
-from ._tracer import OrbitPoint, Trace
+from ._tracer import OrbitPoint, OrbitTracer, Trace, Zero
 
 
 SECANTS = 12  # steps to where the real part is zero
 EXACT = 1e-13  # of the parameter, relative
+SHRUNK = 1e-4  # the size of an orbit, over that at the point before
+SHARES = np.array([0.2, 0.4, 0.6, 0.8])  # of the way to the point before, at which orbits are looked at
 
 
 class _Beside(NamedTuple):
@@ -63,6 +65,31 @@ def hopf_end(name: str, curve: OrbitCurve, trace: Trace) -> tuple[OrbitPoint, Or
     return spot, OrbitBifurcation.hopf(name, spot, curve, way, "supercritical" if side > 0 else "subcritical")
 
 
+def limits(tracer: OrbitTracer, trace: Trace, zero: Zero) -> Zero:
+    """A corner at which orbits shrink to a point, with the limit of their multipliers there.
+
+    At the point the equations do not determine them: whatever is left of the orbit is rounding. Beside it the monodromy
+    matrix depends smoothly on the place along the branch; it is a polynomial through five orbits.
+    """
+    before, spot = trace.spots[-2], zero.spot
+    if len(before.look.u) != len(spot.look.u) or _size(spot) > SHRUNK * _size(before):
+        return zero
+    way = np.asarray(spot.look.u - before.look.u)
+    length = float(before.look.tangent @ way)
+    beside = [tracer.at(before, (1 - x) * length, before.look.u + (1 - x) * way) for x in SHARES]
+    shares = np.array([x for x, there in zip(SHARES, beside) if there is not None] + [1.0])
+    found = [there.monodromy for there in beside if there is not None] + [before.monodromy]
+    # Lagrange's polynomials at zero.
+    weights = [np.prod([-x / (a - x) for x in shares if x != a]) for a in shares]
+    monodromy = sum(w * np.asarray(m) for w, m in zip(weights, found))
+    return zero._replace(spot=dataclasses.replace(spot, stable=before.stable, **_floquet(monodromy)))
+
+
+def _floquet(monodromy: np.ndarray) -> dict[str, np.ndarray]:
+    rho = np.linalg.eigvals(monodromy).astype(complex)
+    return dict(monodromy=monodromy, multipliers=rho[np.argsort(-np.abs(rho), kind="stable")])
+
+
 def _size(spot: OrbitPoint) -> float:
     return float(np.linalg.norm(np.asarray(spot.look.high) - np.asarray(spot.look.low)))
 
@@ -85,10 +112,7 @@ def _point(fold: OrbitPoint, at: _Beside, value: float, y: np.ndarray) -> OrbitP
     look, period = fold.look, np.asarray(2 * np.pi / at.root.imag)
     stretch = float(period / look.period)
     begin = look.begin[0]
-    monodromy = expm(np.asarray(at.found.jacobian) * float(period))
-    multipliers = np.linalg.eigvals(monodromy).astype(complex)
-    multipliers = multipliers[np.argsort(-np.abs(multipliers), kind="stable")]
     still = {part: np.broadcast_to(y, np.shape(getattr(look, part))) for part in ("x", "last", "xs", "low", "high")}
     times = {part: begin + stretch * (getattr(look, part) - begin) for part in ("begin", "end", "ts")}
     look = look._replace(parameter=np.asarray(value), period=period, mean=y, square=y**2, **still, **times)
-    return dataclasses.replace(fold, look=look, multipliers=multipliers, monodromy=monodromy)
+    return dataclasses.replace(fold, look=look, **_floquet(expm(np.asarray(at.found.jacobian) * float(period))))
