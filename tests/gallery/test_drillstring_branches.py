@@ -9,6 +9,7 @@ from drillstring import (
     BETA,
     C_B,
     CONTACT,
+    DELTA,
     drillstring,
     field,
     K,
@@ -23,10 +24,14 @@ from drillstring import (
     RELEASE,
     SLIP,
     slope,
+    solved,
     special_point,
     STOP,
+    T_0,
+    whirl,
 )
-from scipy.optimize import root
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 import nsjax
 from nsjax import gallery
@@ -85,7 +90,7 @@ def check(branch, kind, value):
     rest = np.delete(rho, ones)
     mine = np.asarray(special.multipliers[0])
     mine = np.delete(mine, np.argsort(np.abs(mine - 1))[: len(ones)])
-    alike(mine, rest, 1e-6)
+    alike(mine, rest, 1e-5 if kind == "fold" else 1e-6)  # where the state is known to the root of a rounding error
 
 
 def touching(y, period, omega):
@@ -95,7 +100,7 @@ def touching(y, period, omega):
         start = np.array([1.0, 0.0, *z[:3]])
         return lap(start, z[3], z[4], [(FREE, None)])[0] - start
 
-    z = root(residual, [*y[2:], period, omega], method="hybr", options=dict(xtol=1e-13, eps=1e-14)).x
+    z = solved(residual, [*y[2:], period, omega])
     return np.array([1.0, 0.0, *z[:3]]), z[3], z[4]
 
 
@@ -113,7 +118,8 @@ def p6():
     system = gallery.thesis("A.9", omega=2.5425)
     guess = TwistedWhirl(0.238468107547, 0.0369679337296, 0.199962366887, -0.0944242793382, 0.355375795276)
     orbit = nsjax.find_orbit(system, guess, period=6.0587479941)
-    return nsjax.continue_orbit(system, orbit, "omega", (2.3, 3.6), max_branches=2)
+    with pytest.warns(UserWarning, match="more than `max_branches`"):  # those of twice the period
+        return nsjax.continue_orbit(system, orbit, "omega", (2.5, 2.7), max_branches=2)
 
 
 def test_p6_and_p5_from_the_hopf_point_to_f(p6):
@@ -186,7 +192,7 @@ def limits_at_f(branch, i, omega):
     def residual(x):
         return np.append(lap(x[:5], x[5], side, arcs, linear, over)[0] - x[:5], along @ (x[:5] - z))
 
-    x = root(residual, np.append(z, branch.periods[i]), method="hybr", options=dict(xtol=1e-12, eps=1e-14)).x
+    x = solved(residual, np.append(z, branch.periods[i]))
     return x[5], np.linalg.eigvals(lap(x[:5], x[5], side, arcs, linear, over)[1])
 
 
@@ -197,3 +203,148 @@ def test_the_limits_of_p5_at_f(p6):
     np.testing.assert_allclose(f.period, period, rtol=1e-6)
     alike(f.multipliers[0], rho, 1e-6)
     alike(branch.multipliers[-1], rho, 1e-6)
+
+
+@pytest.fixture(scope="module")
+def p4():
+    """P4, P3 and P2 are one branch."""
+    system = gallery.thesis("A.9", omega=2.5)
+    orbit = nsjax.find_orbit(system, TwistedWhirl(1.0197, 0.2029, 0.7161, 1.9272, -0.8771), period=5.4024)
+    with pytest.warns(UserWarning, match="more than `max_branches`"):
+        return nsjax.continue_orbit(system, orbit, "omega", (2.2, 3.6), max_branches=1)
+
+
+def test_the_way_from_p1_to_f(p4):
+    """P2 is born in the middle of the stator, P3 where it begins to touch, P4 where the bit no more sticks."""
+    bifurcations = [(s.kind, s.discontinuous, round(s.value, 8)) for s in p4.special if s.is_bifurcation]
+    assert bifurcations[1:] == [
+        ("flip", True, 2.36309803),
+        ("fold", False, 2.44306864),
+        ("flip", False, 2.38414967),
+        ("fold", False, 2.38112293),
+        ("Neimark-Sacker", False, 2.46406621),
+        ("fold", False, 2.46434385),
+        ("fold", True, 2.36678973),
+        ("Neimark-Sacker", False, 2.99420602),
+        ("flip", False, 3.12472787),
+        ("flip", False, 3.23239196),
+        ("fold", False, 3.43907773),
+        ("fold", False, 2.57476937),
+        ("Neimark-Sacker", False, 2.57703852),
+    ]
+    f = p4.special[-1]
+    assert f.kind == "end"
+    np.testing.assert_allclose(f.value, OMEGA_F, atol=1e-8)
+    period, rho = limits_at_f(p4, len(p4) - 2, OMEGA_F)
+    np.testing.assert_allclose(f.period, period, rtol=1e-6)
+    alike(f.multipliers[0], rho, 1e-6)
+
+
+@pytest.mark.parametrize(
+    "kind, value",
+    [
+        ("Neimark-Sacker", 2.99420602119),
+        ("flip", 3.12472787101),
+        ("flip", 3.23239196111),
+        ("fold", 3.43907773314),
+        ("fold", 2.57476936905),
+        ("Neimark-Sacker", 2.57703852209),
+        ("fold", 2.44306864091),
+        ("flip", 2.38414967115),
+        ("fold", 2.38112293315),
+        ("Neimark-Sacker", 2.46406620698),
+        ("fold", 2.46434385293),
+    ],
+)
+def test_special_points_of_p4_and_p3(p4, kind, value):
+    check(p4, kind, value)
+
+
+def whirl_of_p1(omega):
+    """The largest modulus of the multipliers of a small whirl while the bit slips to and fro, by scipy: the rotor's
+    equation is linear in the complex plane, and its coefficients follow the bit."""
+
+    def equations(t, x, side):
+        phi, w, (z, v) = x[0].real, x[1].real, x[2:].reshape(2, 2)
+        small = 1e-150  # whose square is zero
+        a = [whirl(small * one, small * rate, omega + w, 0.0)[0] / small for one, rate in zip(z, v)]
+        return np.array([w, -phi - side * T_0 / (1 + DELTA * side * (omega + w)), *v, *a], complex)
+
+    def stands(t, x, side):
+        return side * (x[1].real + omega)
+
+    stands.terminal, stands.direction = True, -1
+    phi = -0.25
+    for _ in range(12):  # the orbit attracts
+        x = np.array([phi, -omega, 1, 0, 0, 1], complex)
+        for side in (1, -1):
+            arc = solve_ivp(
+                equations, (0, 30), x, "DOP853", events=stands, args=(side,), first_step=1e-3, rtol=1e-12, atol=1e-14
+            )
+            x = arc.y[:, -1]
+        phi = x[0].real
+    return np.max(np.abs(np.linalg.eigvals(x[2:].reshape(2, 2))))
+
+
+def test_p2_is_born_at_the_neimark_sacker_point_of_p1(p4):
+    """Where a whirl about the middle neither grows nor decays; in polar coordinates P2 just ends there."""
+    born = brentq(lambda omega: whirl_of_p1(omega) - 1, 2.2, 2.3, xtol=1e-12)
+    np.testing.assert_allclose(p4.values[0], born, atol=1e-8)
+    assert p4.high.r[0] < 1e-8
+
+
+def test_p3_begins_where_p2_touches_the_stator(p4):
+    """The discontinuous flip: a contact of no duration, with the multipliers on both sides of it."""
+    special = next(s for s in p4.special if s.kind == "flip" and s.discontinuous)
+    assert special.count == ((1,), (1, 2)) and special.surfaces == ("wall",)
+    # P2 from where it touches: slip forwards, backwards, stick, slip forwards.
+    arcs = [(FREE, STOP), ((-1, 1, -1), STOP), ((-1, 1, 0), SLIP), (FREE, None)]
+
+    def residual(z):
+        start = np.array([1.0, 0.0, *z[:3]])
+        return lap(start, z[3], z[4], arcs)[0] - start
+
+    i = p4.indices[p4.special.index(special)]
+    guess = flat(special.y)
+    z = solved(residual, [*guess[2:], special.period, special.value])
+    np.testing.assert_allclose([special.period, special.value], z[3:], atol=1e-8)
+    y = np.array([1.0, 0.0, *z[:3]])
+    free = lap(y, z[3], z[4], arcs)[1]
+    sides = [np.linalg.eigvals(free @ jump_of_contact(y, z[4])), np.linalg.eigvals(free)]
+    for mine, want in zip(special.multipliers, sides):
+        alike(mine, want, 1e-6)
+    assert any(s.mode[0] > 0 for s in p4.segments[i + 2]) != any(s.mode[0] > 0 for s in p4.segments[i - 2])
+
+
+def test_p4_begins_where_the_bit_no_more_sticks(p4):
+    """The discontinuous fold: the orbit just comes to θ' = 0."""
+    special = next(s for s in p4.special if s.kind == "fold" and s.discontinuous)
+    assert special.surfaces == ("bit",) and special.count == ((), (1, 1))
+    i = p4.indices[p4.special.index(special)]
+    j = next(j for j in (i, i + 1) if len(p4.segments[j]) <= 4)
+    arcs = [((-1, 1, 1), CONTACT), (TOUCH, RELEASE), (FREE, None)]
+    y, period = at(p4.ys, j), p4.periods[j]
+    # On the orbit from its lowest speed on: w = -ω there, and w' = 0.
+    stop = solve_ivp(
+        lambda t, y: field(y, special.value, FREE), (0, 6), lap(y, 2.7, special.value, arcs)[0], "DOP853",
+        events=_slowest(special.value), rtol=1e-12, atol=1e-13,
+    )  # fmt: skip
+    guess = stop.y_events[0][0]
+
+    def residual(z):
+        start = np.array([*z[:4], -z[5]])
+        return np.append(lap(start, z[4], z[5], arcs)[0] - start, field(start, z[5], FREE)[4])
+
+    z = solved(residual, [*guess[:4], period, special.value])
+    np.testing.assert_allclose([special.period, special.value], z[4:], atol=1e-8)
+    start = np.array([*z[:4], -z[5]])
+    free = lap(start, z[4], z[5], arcs)[1]
+    alike(special.multipliers[0], np.linalg.eigvals(free), 1e-6)
+
+
+def _slowest(omega):
+    def event(t, y):
+        return field(y, omega, FREE)[4]
+
+    event.terminal, event.direction = True, 1
+    return event

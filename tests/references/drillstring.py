@@ -31,7 +31,7 @@ def drillstring(r, u, Omega, phi, w, omega, s):
     theta = omega + w
     normal, along = contact(r, u, r * Omega + theta * R, s[0], s[1])
     a, fluid = whirl(r, u + 1j * r * Omega, theta, -normal + 1j * along)
-    bit = -T_0 * s[2] / (1 + DELTA * abs(theta))
+    bit = -T_0 * s[2] / (1 + DELTA * (s[2] * theta if abs(s[2]) == 1 else abs(theta)))  # smooth at θ' = 0
     twist = (-K_PHI * phi + bit + along * R - fluid.imag * r) / J
     return u, a.real + r * Omega**2, (a.imag - 2 * u * Omega) / r, w, twist
 
@@ -63,7 +63,7 @@ def ending(event, y, omega, s):
     if event == RELEASE:
         return K_B * (r - R_C) + C_B * u
     if event == STOP:
-        return omega + w
+        return s[2] * (omega + w)
     torque = drillstring(*y, omega, (*s[:2], 0))[4] * J  # what friction has to balance: at most T_0
     return T_0 - torque
 
@@ -125,6 +125,14 @@ def of_neimark_sacker(monodromy):
     return np.max(np.abs(rho[np.abs(rho.imag) > 1e-3])) - 1
 
 
+def solved(residual, guess):
+    """MINPACK's root, and two of Newton's steps with better derivatives."""
+    z = root(residual, guess, options=dict(xtol=1e-12, eps=1e-14)).x
+    for _ in range(2):
+        z = z - np.linalg.solve(slope(residual, z, 1e-5), residual(z))
+    return z
+
+
 def special_point(y, time, omega, arcs, test):
     """The orbit near a given one at which a test function of its monodromy matrix is zero: state, period, parameter,
     multipliers. The state is sought at right angles to the flow through the given one."""
@@ -135,6 +143,5 @@ def special_point(y, time, omega, arcs, test):
         end, phi = lap(z[:5], z[5], z[6], arcs)
         return np.concatenate([end - z[:5], [along @ (z[:5] - y), test(phi)]])
 
-    found = root(residual, np.concatenate([y, [time, omega]]), method="hybr", options=dict(xtol=1e-12, eps=1e-14))
-    z = found.x
+    z = root(residual, np.concatenate([y, [time, omega]]), options=dict(xtol=1e-12, eps=1e-14)).x
     return z[:5], z[5], z[6], np.linalg.eigvals(lap(z[:5], z[5], z[6], arcs)[1])

@@ -37,8 +37,9 @@ def hopf_end(name: str, curve: OrbitCurve, trace: Trace) -> tuple[OrbitPoint, Or
     goes back along are the same orbits half a period later. The equations are singular at size zero, and the fold is
     only seen beside the point: that is a zero of the real part of the equilibrium's eigenvalue, which is found here.
     """
-    fold, before = trace.spots[-1], trace.spots[-2]
-    if curve.model.system.period is not None or fold.itinerary.ends[0] != TIME or _size(fold) > 0.5 * _size(before):
+    fold, before, early = trace.spots[-1], trace.spots[-2], trace.spots[-min(5, len(trace.spots))]
+    small = fold.itinerary.ends[0] == TIME and _size(before) < _size(early)
+    if curve.model.system.period is not None or not small:
         return None
     mean = np.asarray(fold.look.mean)
     value, near = fold.parameter, _beside(curve, fold, fold.parameter, mean)
@@ -57,8 +58,10 @@ def hopf_end(name: str, curve: OrbitCurve, trace: Trace) -> tuple[OrbitPoint, Or
         if abs(step) <= EXACT * abs(value):
             break
     y = np.asarray(jfu.ravel_pytree(near.found.y)[0])
-    distance = abs(before.parameter - value)
-    if abs(fold.parameter - value) > 0.25 * distance or np.linalg.norm(mean - y) > _size(fold) + 1e-3 * _size(before):
+    # Beside the point the parameter goes with the square of the size. At a fold it does not, wherever a Hopf point is.
+    by_value = (early.parameter - before.parameter) / (before.parameter - value)
+    by_size = (_size(early) / _size(before)) ** 2 - 1
+    if abs(by_value - by_size) > 0.1 * by_size or np.linalg.norm(mean - y) > _size(before):
         return None
     spot = dataclasses.replace(_point(fold, near, value, y), stable=before.stable)
     way = 1 if before.parameter > value else -1
