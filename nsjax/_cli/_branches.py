@@ -11,7 +11,7 @@ from .. import plot
 from ..continuation.equilibria._branch import CLOSED
 from ..continuation.orbits._bifurcation import OrbitBifurcation
 from ..continuation.orbits._branch import OrbitBranch
-from ..plot._diagram import write_names
+from ..plot._diagram import UNSTABLE, write_names
 from ..plot._orbit_branch import amplitude
 from ._job import Job, UsageError
 from ._pictures import figure, save
@@ -29,8 +29,17 @@ class Arc(NamedTuple):
     ends: frozenset[str]  # letters, or kinds, of the special points
 
 
+class Measure(NamedTuple):
+    """What stands for an orbit, and for the equilibrium that the thesis draws beside it."""
+
+    of: Callable[[OrbitBranch], Any] | None = None  # by default the amplitude
+    label: str = ""
+    equilibrium: Callable[[Any, np.ndarray], Any] | None = None  # at values of the parameter
+    stable: bool = True
+
+
 class Diagram(NamedTuple):
-    """How section 6.6, 6.7, 6.8 or 6.9 shows its system."""
+    """How the thesis shows the branches of a system."""
 
     parameter: str
     interval: tuple[float, float]
@@ -40,7 +49,7 @@ class Diagram(NamedTuple):
     which: str = "all"
     view: tuple[float, float] | None = None  # of the multipliers
     enlarged: tuple[tuple[float, float], tuple[float, float]] | None = None
-    equilibrium: Callable[[Any], float] | None = None
+    measure: Measure = Measure()
 
     def names(self, branch: OrbitBranch) -> Callable[[OrbitBifurcation], str]:
         """Letters, or else kinds. Orbits of several times the period that bifurcate with the others are not named, and
@@ -81,7 +90,7 @@ def _arcs_69(arc: Arc) -> str:
 
 DIAGRAMS = {
     "6.6": Diagram("omega", (0.5, 2.0), {("none", True): "$\\omega_A$", ("fold", True): "$\\omega_B$"}),
-    "6.7": Diagram("v_dr", (0.1, 1.2), equilibrium=lambda system: system.F_slip / system.k),
+    "6.7": Diagram("v_dr", (0.1, 1.2), measure=Measure(equilibrium=lambda system, _: system.F_slip / system.k)),
     "6.8": Diagram(
         "omega",
         (0.5, 0.8),
@@ -98,8 +107,12 @@ DIAGRAMS = {
         view=(-4.0, 4.0),
         enlarged=((1.65, 1.73), (2.0, 2.3)),
     ),
-    "A.8": Diagram("omega", (0.05, 3.0)),  # p1
-    "A.9": Diagram("omega", (2.3, 3.6)),  # P4, and P3, P2 that it goes over into
+    "A.8": Diagram(  # p1 and e1, Fig. A.7b
+        "omega",
+        (0.05, 3.0),
+        measure=Measure(lambda p1: p1.low.w + p1.values, "min θ' [rad/s]", lambda _, omega: omega, stable=False),
+    ),
+    "A.9": Diagram("omega", (2.2, 3.6)),  # P4, and P3, P2 that it goes over into
 }
 
 
@@ -144,10 +157,14 @@ def _diagram(branch: OrbitBranch, diagram: Diagram, names: Any, labels: dict[Any
     ax = drawn.add_subplot()
     if view is not None:
         ax.set(xlim=view[0], ylim=view[1])
-    if diagram.equilibrium is not None:
-        height = float(diagram.equilibrium(branch.system))
-        ax.plot(diagram.interval, [height, height], color="0.6", linewidth=1.6, label="stable equilibrium")
-    plot.orbit_diagram(branch, ax=ax, labels=labels, names=names)
+    measure = diagram.measure
+    if measure.equilibrium is not None:
+        ends = np.array(diagram.interval)
+        heights = np.broadcast_to(measure.equilibrium(branch.system, ends), ends.shape)
+        style, word = ("-", "stable") if measure.stable else (UNSTABLE, "unstable")
+        ax.plot(ends, heights, color="0.6", linewidth=1.6, linestyle=style, label=f"{word} equilibrium")
+    words = labels | {"measure": measure.label} if measure.label else labels
+    plot.orbit_diagram(branch, measure.of, ax=ax, labels=words, names=names)
     if callable(names):
         _number_arcs(ax, branch, diagram, names)
     return drawn

@@ -9,6 +9,7 @@ from command_line import run
 
 import nsjax
 from nsjax import __main__ as command, _cli
+from nsjax._cli import _branches
 from nsjax._cli._report import _symbol
 
 
@@ -104,6 +105,21 @@ def test_the_diagram_shows_the_equilibrium(continued, tmp_path):
     job = _cli.load("6.7", {}, None)
     files = _cli.draw_branches(job, branch, _cli.diagram_for(job, None, None), tmp_path)
     assert [path.name for path in files] == ["6.7-bifurcation-diagram.png", "6.7-multiplier-diagram.png"]
+
+
+@pytest.mark.slow
+def test_the_drillstring_is_shown_by_its_lowest_speed(tmp_path):
+    """Fig. A.7b: of branch p1 the least θ', and e1, unstable, on which θ' = ω."""
+    job = _cli.load("A.8", {}, None)
+    orbit = nsjax.find_orbit(job.system, job.guess.y0, period=job.guess.period)
+    branch = nsjax.continue_orbit(job.system, orbit, "omega", (1.95, 2.05))
+    diagram = _cli.diagram_for(job, None, (1.95, 2.05))
+    (ax,) = _branches._diagram(branch, diagram, True, {}).axes
+    assert ax.get_ylabel() == "min θ' [rad/s]"
+    e1, p1 = (np.array(line.get_xydata()) for line in ax.lines[:2])
+    np.testing.assert_array_equal(e1[:, 0], e1[:, 1])
+    assert ax.lines[0].get_label() == "unstable equilibrium" and np.all(p1[:, 1] < 0)  # it slips backwards
+    assert _cli.draw_branches(job, branch, diagram, tmp_path)
 
 
 def test_run_with_branches_continues_its_orbit(continued, monkeypatch, tmp_path):

@@ -336,6 +336,7 @@ def test_relay():
     np.testing.assert_allclose(branch.periods[apart], period, rtol=1e-8, atol=1e-14)
     np.testing.assert_allclose(t[[0, -1]], [18, 35], atol=1e-11)
     assert branch.periods[-1] > 28  # which 1e-11 before the end it is
+    np.testing.assert_allclose(branch.multipliers[apart], np.ones((apart.sum(), 1)), atol=1e-6)  # a shift in time
     assert [b.kind for b in branch.special_points] == ["end", "end"]
     assert [b.count for b in branch.special_points] == [((), (1,)), ((1,), ())]
 

@@ -207,7 +207,7 @@ def factors_of(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, df: Array
 def _infinitely_unstable(n: int, autonomous: bool) -> tuple[Array, Array, Array]:
     """Monodromy matrix, multipliers, and whether it is stable, of an orbit that slides on a surface that repels."""
     rest = [1.0] * autonomous + [jnp.nan] * (n - 1 - autonomous)
-    return jnp.full((n, n), jnp.inf), jnp.array([jnp.inf, *rest], complex), jnp.array(False)
+    return jnp.full((n, n), jnp.inf), jnp.array([jnp.inf, *rest][:n], complex), jnp.array(False)
 
 
 def _at_ends(
