@@ -209,9 +209,9 @@ def _diagram(job: Job, parameter: str | None, interval: str | None) -> Diagram:
 
 
 def _branches(args: argparse.Namespace, job: Job, orbit: Orbit, diagram: Diagram) -> OrbitBranch:
-    laps = {"max_laps": args.max_laps} if args.command == "continue" else {}
+    laps = getattr(args, "max_laps", None) or diagram.laps
     return continue_orbit(
-        job.system, orbit, diagram.parameter, diagram.interval, **laps, progress=True, **_controller(args)
+        job.system, orbit, diagram.parameter, diagram.interval, max_laps=laps, progress=True, **_controller(args)
     )
 
 

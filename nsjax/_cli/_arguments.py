@@ -86,9 +86,9 @@ def _parser() -> argparse.ArgumentParser:
     follow.add_argument(
         "--max-laps",
         type=_count,
-        default=4,
+        default=None,
         metavar="N",
-        help="the longest period that is followed, over that of the orbit (default: 4)",
+        help="the longest period that is followed, over that of the orbit (default: 4, of A.9 1)",
     )
     for command in (run, follow):
         command.add_argument(

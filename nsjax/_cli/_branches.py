@@ -50,10 +50,12 @@ class Diagram(NamedTuple):
     view: tuple[float, float] | None = None  # of the multipliers
     enlarged: tuple[tuple[float, float], tuple[float, float]] | None = None
     measure: Measure = Measure()
+    laps: int = 4  # the longest period that is followed, over that of the orbit
+    kinds: bool = True  # whether special points without a letter are named by their kind
 
     def names(self, branch: OrbitBranch) -> Callable[[OrbitBifurcation], str]:
-        """Letters, or else kinds. Orbits of several times the period that bifurcate with the others are not named, and
-        of points of one kind it is that with the shortest period that has the letter."""
+        """Letters, or else perhaps kinds. Orbits of several times the period that bifurcate with the others are not
+        named, and of points of one kind it is that with the shortest period that has the letter."""
         words: dict[tuple, str] = {}
         named: list[float] = []
         for special in sorted(branch.special_points, key=lambda b: b.period):
@@ -61,7 +63,8 @@ class Diagram(NamedTuple):
                 continue
             letter = self.letters.get((special.kind, special.discontinuous), "")
             close = any(abs(special.value - value) <= 1e-6 * abs(value) for value in named)
-            words[_place(special)] = "" if close else special.kind if letter in ("", *words.values()) else letter
+            kind = special.kind if self.kinds else ""
+            words[_place(special)] = "" if close else kind if letter in ("", *words.values()) else letter
             named.append(special.value)
         return lambda special: words[_place(special)]
 
@@ -112,7 +115,15 @@ DIAGRAMS = {
         (0.05, 3.0),
         measure=Measure(lambda p1: p1.low.w + p1.values, "min θ' [rad/s]", lambda _, omega: omega, stable=False),
     ),
-    "A.9": Diagram("omega", (2.2, 3.6)),  # P4, and P3, P2 that it goes over into
+    "A.9": Diagram(  # P2, P3 and P4, Figs. A.10 and A.11
+        "omega",
+        (2.2, 3.6),
+        {("branch point", False): "P1", ("flip", True): "P2 | P3", ("fold", True): "P3 | P4", ("end", True): "f"},
+        kinds=False,
+        laps=1,  # the thesis does not follow those of twice the period, and each takes minutes
+        view=(0.0, 4.0),
+        enlarged=((2.34, 3.46), (0.998, 1.052)),
+    ),
 }
 
 
