@@ -257,6 +257,10 @@ def test_in_cartesian_coordinates_the_middle_is_an_equilibrium_and_a_whirl_an_or
     orbit = nsjax.find_orbit(scene, scene.state(dict(x=r), dict(y=r * Omega)), period=2 * np.pi / Omega)
     np.testing.assert_allclose(orbit.period, 2 * np.pi / Omega, rtol=1e-11)
     np.testing.assert_allclose(np.hypot(orbit.y0.q.x, orbit.y0.q.y), r, rtol=1e-10)
+    whirls = nsjax.continue_orbit(scene, orbit, "omega", (2.5, 2.645))
+    (born,) = [s for s in whirls.special_points if s.kind == "Hopf"]
+    assert born.name == "Hopf bifurcation, supercritical"
+    np.testing.assert_allclose([born.value, born.period], [OMEGA_C, 2 * np.pi / (BETA * OMEGA_C / 2)], rtol=1e-10)
 
 
 # A.8: stick-slip.
