@@ -4,10 +4,12 @@ import argparse
 import json
 import pathlib
 import sys
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax
+import jax.numpy as jnp
 
 from . import gallery
 from ._cli import (
@@ -39,17 +41,24 @@ from ._cli import (
 )
 from .continuation.orbits._branch import OrbitBranch
 from .continuation.orbits._continue_orbit import continue_orbit
+from .derivatives._flow_map import solution, with_room
+from .flow._arguments import check_span, checked_start, checked_time
 from .flow._diagnosis import explain
+from .flow._integrator import Integrator
 from .flow._results import is_okay, RESULTS, SolveError
 from .flow._solution import Solution
 from .flow._solve import solve
 from .orbits._find_orbit import find_orbit
+from .orbits._guess import of_relays
 from .orbits._orbit import Orbit
 from .system._parameter import get_parameter, parameter_path
+from .system._system import arrays_of
 
 
 FAILURE = 1  # exit status of a numerical failure; `USAGE` is that of a mistake
 DEFAULT_TOL = 1e-12
+BOUNDS = dict(max_steps=20_000, max_events=1024)
+DENSE = dfx.SaveAt(dense=True)
 Start = tuple[Any, dict[str, int] | None]  # a state, and the modes that were given for it
 
 
@@ -93,15 +102,23 @@ def _start(job: Job) -> Any:
     return job.y0
 
 
-def _simulate(args: argparse.Namespace, job: Job, t0: float) -> Solution:
+def _simulate(args: argparse.Namespace, job: Job, t0: float, search: bool) -> Solution:
+    """The solution from the start, with dense output. Where a `search` for an orbit follows, it is that of the search's
+    own program, as every program takes seconds to trace and compile."""
     t1 = job.t1 if args.t1 is None else args.t1
     if t1 is None:
         t1 = t0 + (100.0 if job.system.period is None else 20 * float(job.system.period))
     _note(f"following the solution to t = {t1:g}")
-    sol = solve(
-        job.system, t0, t1, _start(job), mode=_mode(args, job), saveat=dfx.SaveAt(dense=True, t1=True),
-        max_steps=20_000, max_events=1024, throw=False, **_controller(args),
-    )  # fmt: skip
+    how, mode = _controller(args) | BOUNDS, _mode(args, job)
+    if search:
+        start, y0, given = checked_start(job.system, t0, _start(job), mode)
+        stop = checked_time("t1", t1, start.dtype)
+        check_span(job.system, start, stop, DENSE)
+        integrator = with_room(Integrator(**how).checked(start.dtype), start.dtype)
+        relays = of_relays(job.system, [jnp.zeros((), jnp.int32)] * len(job.system.switches)) or {}
+        sol = solution(arrays_of(job.system, start.dtype), start, stop, y0, relays | given or None, integrator)
+    else:
+        sol = solve(job.system, t0, t1, _start(job), mode=mode, saveat=DENSE, throw=False, **how)
     if sol.result == RESULTS.wrong_contact or sol.result == RESULTS.wrong_parameter:  # a mistake in the model
         raise SolveError(explain(job.system, sol))
     return sol
@@ -164,7 +181,7 @@ def _try(args: argparse.Namespace, job: Job, t0: float, guess: _Guess) -> tuple[
     try:
         orbit = find_orbit(
             job.system, guess.y0, period=guess.period, t0=t0, order=guess.order, mode=guess.mode, throw=False,
-            tol=_tolerances(args)["newton"], **_controller(args),
+            tol=_tolerances(args)["newton"], **_controller(args), **BOUNDS,
         )  # fmt: skip
     except RuntimeError as error:
         if mistake(error, model_file(args.system)) is not None:
@@ -173,14 +190,15 @@ def _try(args: argparse.Namespace, job: Job, t0: float, guess: _Guess) -> tuple[
     return (orbit, None) if orbit.result == RESULTS.successful else (None, advice(orbit.result))
 
 
-def _write_json(file: str | None, numbers: dict[str, Any]) -> None:
-    if file is None:
+def _write_json(args: argparse.Namespace, job: Job, numbers: Callable[[], dict[str, Any]]) -> None:
+    """What was computed, if that is asked for."""
+    if args.json is None:
         return
-    text = json.dumps(numbers, indent=1, allow_nan=False) + "\n"
-    if file == "-":
+    text = json.dumps(record(job, _tolerances(args), **numbers()), indent=1, allow_nan=False) + "\n"
+    if args.json == "-":
         sys.stdout.write(text)
     else:
-        path = pathlib.Path(file)
+        path = pathlib.Path(args.json)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
 
@@ -221,23 +239,28 @@ def _run(args: argparse.Namespace) -> int:
         raise UsageError(f"--branches is for {', '.join(DIAGRAMS)}; for others there is `nsjax continue`.")
     diagram = _diagram(job, None, None) if args.branches else None
     t0 = job.t0 if args.t0 is None else args.t0
-    sol = _simulate(args, job, t0)
+    search = job.guess is not None or args.period is not None or not job.from_gallery
+    sol = _simulate(args, job, t0, search)
     orbit, trouble = None, None
     if job.guess is not None:
         orbit, trouble = _find(args, job, t0, (job.guess.y0, None), (job.y0, _mode(args, job)))
-    elif is_okay(sol.result) and (args.period is not None or not job.from_gallery):
+    elif search and is_okay(sol.result):
         orbit, trouble = _find(args, job, t0, (job.y0, _mode(args, job)))
     files = draw(job, sol, orbit, args.out)
     words = [report(job, sol, orbit, trouble)]
-    found = {"simulation": simulation_record(sol), "orbit": None if orbit is None else orbit_record(orbit)}
+    branch = None
     if diagram is not None and orbit is not None:
         branch = _branches(args, job, orbit, diagram)
         files += draw_branches(job, branch, diagram, args.out)
         words += ["", str(branch)]
-        found["continuation"] = branch_record(branch)
     out = sys.stderr if args.json == "-" else sys.stdout
     print(*words, "", *files, sep="\n", file=out)
-    _write_json(args.json, record(job, _tolerances(args), **found))
+
+    def computed() -> dict[str, Any]:
+        found = {"simulation": simulation_record(sol), "orbit": None if orbit is None else orbit_record(orbit)}
+        return found if branch is None else found | {"continuation": branch_record(branch)}
+
+    _write_json(args, job, computed)
     return 0 if is_okay(sol.result) or sol.result == RESULTS.accumulation_reached else FAILURE
 
 
@@ -254,7 +277,7 @@ def _orbit(args: argparse.Namespace) -> int:
         return FAILURE
     if args.json != "-":
         print(report(job, None, orbit, None))
-    _write_json(args.json, record(job, _tolerances(args), orbit=orbit_record(orbit)))
+    _write_json(args, job, lambda: {"orbit": orbit_record(orbit)})
     return 0
 
 
@@ -270,7 +293,7 @@ def _continue(args: argparse.Namespace) -> int:
     files = draw_branches(job, branch, diagram, args.out)
     out = sys.stderr if args.json == "-" else sys.stdout
     print(report(job, None, None, None), "", branch, "", *files, sep="\n", file=out)
-    _write_json(args.json, record(job, _tolerances(args), **branch_record(branch)))
+    _write_json(args, job, lambda: branch_record(branch))
     return 0
 
 

@@ -20,13 +20,14 @@ def cache_folder() -> pathlib.Path:
 
 
 def keep_programs() -> None:
-    """Compiled programs are written to the user's cache, unless JAX was told of another place for them."""
-    if jax.config.values.get("jax_compilation_cache_dir"):
-        return
-    folder = cache_folder()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # a home that cannot be written to: every command compiles for itself
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    """Compiled programs are written to the user's cache, or where JAX was told to keep them; small ones too, of which a
+    command has several dozen."""
+    if not jax.config.values.get("jax_compilation_cache_dir"):
+        folder = cache_folder()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:  # a home that cannot be written to: every command compiles for itself
+            return
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

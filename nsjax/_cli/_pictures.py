@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from .. import plot
-from ..derivatives._variational import fundamental_matrix
+from ..derivatives._variational import matrices_along
 from ..flow._solution import Solution
+from ..flow._solve import solve
 from ..orbits._orbit import Orbit
+from ..orbits._passage import passage
 from ..plot import components
 from ..plot._path import arcs, solved
 from ._job import Job
@@ -80,18 +82,20 @@ def _fundamental_matrix(orbit: Orbit, names: list[str], labels: dict[Any, str]) 
     """Φ over one period; for an autonomous system from the maximum of the first component, as in Fig. 3.7."""
     n = len(names)
     drawn = figure(1.2 + 2.6 * n, 1.0 + 1.9 * n)
-    t0, y0, mode = orbit.t0, orbit.y0, orbit.mode
+    period, t0, y0, sol = float(orbit.period), orbit.t0, orbit.y0, solved(orbit)
     if orbit.system.period is None:
-        sol = solved(orbit)
         # Not at an event itself, where the flow has only one-sided derivatives.
         tops = [(arc.y[names[0]][1:-1].max(), arc.t[1 + arc.y[names[0]][1:-1].argmax()], arc.mode) for arc in arcs(sol)]
-        _, t0, mode = max(tops)
-        y0 = sol.evaluate(t0)
-    period = float(orbit.period)
-    jumps = np.sort((np.asarray(orbit.events.t[: len(orbit.events)]) - float(t0)) % period)
+        _, top, mode = max(tops)
+        t0, y0 = np.asarray(top, np.asarray(t0).dtype), sol.evaluate(top)
+        sol = passage(orbit, t0, y0, mode)
+        if sol is None:
+            how = dict(mode=[int(m) for m in mode], throw=False) | orbit.integrator.arguments
+            sol = solve(orbit.system, t0, t0 + period, y0, **how)
+    jumps = np.sort((np.asarray(orbit.events.t)[: len(orbit.events)] - float(t0)) % period)
     nearby = 1e-9 * period  # both sides of each jump
     ts = np.sort(np.concatenate([np.linspace(0, period, 400), jumps - nearby, jumps + nearby]))
-    phi = fundamental_matrix(orbit.system, t0, t0 + period, y0, ts=float(t0) + ts, mode=[int(m) for m in mode])
+    phi = matrices_along(sol, y0, float(t0) + ts, orbit.integrator, throw=False)
     axes = drawn.subplots(n, n, sharex=True, squeeze=False)
     plot.fundamental_matrix(ts, phi, jumps, axes=axes, labels=labels)
     return drawn

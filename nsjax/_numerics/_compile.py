@@ -30,10 +30,14 @@ QUICKEST = {**QUICK, "xla_backend_optimization_level": 0}
 @ft.cache
 def _options(often: bool) -> dict[str, Any]:
     """Those that this version of XLA knows."""
-    known = {}
-    for name, value in (QUICK if often else QUICKEST).items():
+    wanted, trivial = QUICK if often else QUICKEST, jax.jit(lambda x: x).lower(0.0)
+    known: dict[str, Any] = {}
+    with contextlib.suppress(Exception):  # nearly always all of them
+        trivial.compile(dict(wanted))
+        return dict(wanted)
+    for name, value in wanted.items():
         with contextlib.suppress(Exception):
-            jax.jit(lambda x: x).lower(0.0).compile({name: value})
+            trivial.compile({name: value})
             known[name] = value
     return known
 
@@ -63,9 +67,8 @@ def interactive(fn: F, often: bool = False) -> F:
 
     @ft.wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if not trace_state_clean():  # the options can only be given to the outermost program
-            return within(*args, **kwargs)
         with without_collection():
-            return alone()(*args, **kwargs)
+            # The options can only be given to the outermost program.
+            return (alone() if trace_state_clean() else within)(*args, **kwargs)
 
     return cast(F, call)

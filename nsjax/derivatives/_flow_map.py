@@ -5,6 +5,7 @@ other numbers. The directions in which it is differentiated are numbers too, so 
 time and by any parameter are no programs of their own.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -34,9 +35,10 @@ class Directions(NamedTuple):
     @classmethod
     def of_state(cls, system: System, t0: Scalar, y0: Y) -> "Directions":
         """Each component of the state in turn; and last nothing, to be replaced."""
-        x, unravel = jfu.ravel_pytree(jax.tree.map(np.asarray, y0))
-        rows = np.eye(len(x) + 1, len(x), dtype=t0.dtype)
-        leaves = [np.stack(leaf) for leaf in zip(*(jax.tree.leaves(unravel(row)) for row in rows))]
+        shapes = [np.shape(leaf) for leaf in jax.tree.leaves(y0)]
+        ends = np.cumsum([math.prod(shape) for shape in shapes])
+        rows = np.eye(ends[-1] + 1, ends[-1], dtype=t0.dtype)
+        leaves = [x.reshape(len(rows), *shape) for x, shape in zip(np.split(rows, ends[:-1], axis=1), shapes)]
         none = np.zeros(len(rows), t0.dtype)
         numbers = eqx.filter(system, eqx.is_inexact_array)
         still = jax.tree.map(lambda a: np.zeros((len(rows), *a.shape), a.dtype), numbers)
@@ -68,6 +70,12 @@ def flow_map(
     numbers, rest = eqx.partition(system, moves)
     directions = directions._replace(system=eqx.filter(directions.system, moves))
     return _flow_map(numbers, rest, *where[:-1], directions)
+
+
+def solution(system: System, t0: Scalar, t1: Scalar, y0: Y, mode: Any, integrator: Integrator) -> Solution:
+    """The solution alone, with dense output, by the same program: where a search is near, it is compiled anyway."""
+    numbers, rest = eqx.partition(system, eqx.is_inexact_array)
+    return _flow_map(numbers, rest, t0, t1, y0, mode, integrator, Directions.of_state(system, t0, y0))[0]
 
 
 @interactive

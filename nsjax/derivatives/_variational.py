@@ -76,13 +76,26 @@ def fundamental_matrix(
         phi, sol = jax.jit(jax.jacfwd(flow, has_aux=True))(flat)
     else:
         sol = solve(system, t0, t1, y0, **how)
-        whole, phi = _by_arcs(arrays_of(system, t0.dtype), sol, t0, y0, times, integrator)
-        phi = whole[None] if ts is None else phi
+        return matrices_along(sol, y0, ts, integrator, throw)
+    phi = _checked(sol, t0, times, phi, throw)
+    return phi[0] if ts is None else phi
+
+
+def matrices_along(sol: Solution, y0: Y, ts: Any, integrator: Integrator, throw: bool) -> Array:
+    """`fundamental_matrix` along a solution that is known, which set out from `y0`, by the variational equation."""
+    t0 = jnp.asarray(sol.t0)
+    times = jnp.asarray([sol.t1] if ts is None else ts, t0.dtype)
+    whole, phi = _by_arcs(arrays_of(sol.system, t0.dtype), sol, t0, y0, times, integrator)
+    phi = _checked(sol, t0, times, whole[None] if ts is None else phi, throw)
+    return phi[0] if ts is None else phi
+
+
+@interactive
+def _checked(sol: Solution, t0: Scalar, times: Array, phi: Array, throw: bool) -> Array:
+    """NaN, or an error, where there are no derivatives."""
     beyond = _beyond_grazing(sol, t0, times)
     phi = jnp.where(beyond[:, None, None], jnp.nan, phi)
-    if throw:
-        phi = raise_if(jnp.any(beyond), RESULTS.tangential_event, phi)
-    return phi[0] if ts is None else phi
+    return raise_if(jnp.any(beyond), RESULTS.tangential_event, phi) if throw else phi
 
 
 def _beyond_grazing(sol: Solution, t0: Scalar, times: Float[Array, " times"]) -> Bool[Array, " times"]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._numerics._compile import interactive
 from .._numerics._text import between, known, shown, written
 from .._types import Scalar, StateT, Y
 from ..system._mode import change_words, mode_words
@@ -78,14 +79,15 @@ class Events(eqx.Module, Generic[StateT]):
         n = len(self)
         if not -n <= i < n:
             raise IndexError(f"There are {n} events.")
-        i = i % n
+        # (As NumPy's arrays, of which taking an entry out compiles nothing.)
+        log, i = jax.tree.map(np.asarray, self), i % n
 
-        def named(mode: Array) -> dict[str, int]:
+        def named(mode: np.ndarray) -> dict[str, int]:
             return {name: int(m) for name, m in zip(self.names, mode)}
 
-        t, *rest = jax.tree.map(lambda x: x[i], (self.t, self.y_before, self.y_after, self.transversality))
-        modes = named(self.mode_before[i]), named(self.mode_after[i])
-        return Event(t, self.names[int(self.switch[i])], *modes, *rest)
+        t, *rest = jax.tree.map(lambda x: x[i], (log.t, log.y_before, log.y_after, log.transversality))
+        modes = named(log.mode_before[i]), named(log.mode_after[i])
+        return Event(t, self.names[int(log.switch[i])], *modes, *rest)
 
     def __iter__(self) -> Iterator[Event[StateT]]:
         return (self[i] for i in range(len(self)))
@@ -246,39 +248,57 @@ class Solution(eqx.Module, Generic[StateT]):
         """
         if self.dense is None:
             raise ValueError("Dense output was not kept; call `solve` with `saveat=SaveAt(dense=True)`.")
-        starts, stops, points, direction, steps = self.dense
+        starts, stops, _, direction, _ = self.dense
         if stops.ndim != 1:
             raise ValueError(
                 "This is a batch of solutions: evaluate them lane by lane, `jax.vmap(lambda sol: sol(t))(solutions)`."
             )
-        t = jnp.asarray(t, starts.dtype)
-        first, last = self.t0 * direction, self.t1 * direction
-        # Times such as 0.1 + 0.2 are off by rounding, which is not meant.
-        slack = 4 * float(jnp.finfo(starts.dtype).eps) * (jnp.abs(first) + jnp.abs(last))
-        outside = ~((t * direction >= first - slack) & (t * direction <= last + slack))
-        if known((t, outside)) and outside.any():
-            wrong = np.ravel(np.asarray(t)[np.asarray(outside)])
+        span = self.t0, self.t1
+        if not known((t, span, self.dense)):
+            return _evaluated(self.dense, span, jnp.asarray(t, starts.dtype), left)
+        times = np.asarray(t, starts.dtype)
+        outside = _outside(*(np.asarray(x) * np.asarray(direction) for x in (times, *span)))
+        if outside.any():
+            wrong = np.ravel(times)[np.ravel(outside)]
             raise ValueError(
                 f"Argument `t` must lie between t0 = {float(self.t0):.10g} and t1 = {float(self.t1):.10g}, but got "
                 f"{wrong[0]:.10g}" + (f" and {len(wrong) - 1} other times outside." if len(wrong) > 1 else ".")
             )
-
-        def at(s: Scalar) -> Y:
-            i = jnp.searchsorted(stops, s, side="left" if left else "right")
-            i = jnp.clip(i, 0, jnp.maximum(steps - 1, 0))
-            length = stops[i] - starts[i]
-            # (While impacts accumulate no step is under way: the state is the one after them.)
-            u = jnp.where(length > 0, (s - starts[i]) / jnp.where(length > 0, length, 1), 1.0)
-            return bernstein(jax.tree.map(lambda p: p[i], points), _clipped(u, 0, 1))
-
-        ys = jax.vmap(at)(jnp.ravel(_clipped(t * direction, first, last)))
-
-        def shaped(y: Array) -> Array:
-            y = y.reshape(t.shape + y.shape[1:])
-            # A factor makes its derivative NaN too.
-            return y * jnp.where(outside.reshape(t.shape + (1,) * (y.ndim - t.ndim)), jnp.nan, 1)
-
-        return jax.tree.map(shaped, ys)
+        return _evaluated_alone(self.dense, span, jnp.asarray(times), left)
 
     def __call__(self, t: Any, left: bool = True) -> StateT:
         return self.evaluate(t, left)
+
+
+def _outside(s: Any, first: Any, last: Any) -> Any:
+    """Which times lie outside of a solution, apart from rounding: times such as 0.1 + 0.2 are off by that."""
+    slack = 4 * float(jnp.finfo(s.dtype).eps) * (abs(first) + abs(last))
+    return ~((s >= first - slack) & (s <= last + slack))
+
+
+def _evaluated(dense: Any, span: tuple[Scalar, Scalar], t: Array, left: bool) -> Y:
+    """The states at times, from `Solution.dense` and the ends of the solution; NaN outside."""
+    starts, stops, points, direction, steps = dense
+    first, last = (end * direction for end in span)
+    outside = _outside(t * direction, first, last)
+
+    def at(s: Scalar) -> Y:
+        i = jnp.searchsorted(stops, s, side="left" if left else "right")
+        i = jnp.clip(i, 0, jnp.maximum(steps - 1, 0))
+        length = stops[i] - starts[i]
+        # (While impacts accumulate no step is under way: the state is the one after them.)
+        u = jnp.where(length > 0, (s - starts[i]) / jnp.where(length > 0, length, 1), 1.0)
+        return bernstein(jax.tree.map(lambda p: p[i], points), _clipped(u, 0, 1))
+
+    ys = jax.vmap(at)(jnp.ravel(_clipped(t * direction, first, last)))
+
+    def shaped(y: Array) -> Array:
+        y = y.reshape(t.shape + y.shape[1:])
+        # A factor makes its derivative NaN too.
+        return y * jnp.where(outside.reshape(t.shape + (1,) * (y.ndim - t.ndim)), jnp.nan, 1)
+
+    return jax.tree.map(shaped, ys)
+
+
+# Called directly it is one small program: each of its operations by itself would be compiled too.
+_evaluated_alone = interactive(_evaluated, often=True)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +15,7 @@ from .._numerics._text import components
 from .._types import Y
 from ..flow._solution import Events, Solution
 from ..orbits._orbit import Orbit
+from ..orbits._passage import passage
 
 
 DENSE = dfx.SaveAt(dense=True)
@@ -46,18 +48,25 @@ def solved(of: Any) -> Solution:
     if isinstance(of, Solution):
         sol = of
     else:
-        sol = of.solve(saveat=DENSE, throw=False) if isinstance(of, Orbit) else of.solve(saveat=DENSE)
-        if isinstance(of, Orbit) and not _returns(of, sol):
-            sol = _arc_by_arc(of, sol)
+        sol = of.solve(saveat=DENSE) if not isinstance(of, Orbit) else once_round(of)
     if np.ndim(sol.t1):
         raise ValueError("Argument `sol` must be one solution, but it is a batch of them (from `jax.vmap`).")
-    return sol
+    # Taking rows out of NumPy's arrays compiles nothing.
+    return eqx.tree_at(lambda sol: sol.events, sol, jax.tree.map(np.asarray, sol.events))
+
+
+def once_round(orbit: Orbit) -> Solution:
+    """One period of an orbit, or its arcs where its solution leaves it."""
+    one = np.ndim(orbit.period) == 0
+    sol = passage(orbit, orbit.t0, orbit.y0, orbit.mode) if one else None
+    sol = orbit.solve(saveat=DENSE, throw=False) if sol is None else sol
+    return sol if _returns(orbit, sol) else _arc_by_arc(orbit, sol)
 
 
 def _returns(orbit: Orbit, sol: Solution) -> bool:
     if np.ndim(sol.t1):
         return True
-    gap = jax.tree.map(lambda a, b: np.max(np.abs(np.asarray(a - b)), initial=0.0), sol.y1, orbit.y0)
+    gap = jax.tree.map(lambda a, b: np.max(np.abs(np.asarray(a) - np.asarray(b)), initial=0.0), sol.y1, orbit.y0)
     size = jax.tree.map(lambda a: 1 + np.max(np.abs(np.asarray(a)), initial=0.0), orbit.y0)
     return all(a <= 1e-3 * b for a, b in zip(jax.tree.leaves(gap), jax.tree.leaves(size)))
 

@@ -60,7 +60,7 @@ def phase_portrait(
 
     **Raises:** `ValueError` for an unknown component, a batch of solutions, or one without states along the way.
     """
-    unstable = isinstance(sol, Orbit) and not bool(jnp.all(sol.stable))
+    unstable = isinstance(sol, Orbit) and not np.all(sol.stable)
     sol = solved(sol)
     x, y = chosen(components(sol.y1), [x, y])
     ax = axes_or_new(ax)
@@ -104,7 +104,7 @@ def _draw_surfaces(ax: "Axes", sol: Solution, x: str, y: str) -> None:
         for guard, style in _guards(switch):
             if not is_constant(lambda t, g=guard: g(sol.system, t, sol.y1), sol.t0):
                 continue
-            h = jax.vmap(lambda point, g=guard: g(sol.system, sol.t0, unravel(point)))(plane)
+            h = jax.jit(jax.vmap(lambda point, g=guard: g(sol.system, sol.t0, unravel(point))))(plane)
             h = np.asarray(h).reshape(GRID, GRID)
             if h.min() < 0 < h.max():
                 _draw_surface(ax, switch, along[0], along[1], h, style, drawn)

@@ -1,5 +1,8 @@
 """`find_orbit` where all numbers are known: Python calls one program, and finds what the traced search finds."""
 
+import contextlib
+
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,11 +11,13 @@ from models import Motion
 
 import nsjax
 from nsjax import find_orbit, gallery
+from nsjax.orbits._passage import passage
+from nsjax.plot._path import once_round
 
 
-def test_a_new_number_is_no_new_program():
-    """Issue 22: neither another parameter nor another guess is compiled for."""
-    find_orbit(gallery.StickSlip(), Motion(2.02, 0.0), period=13.54)
+@contextlib.contextmanager
+def compilations():
+    """Of which programs are compiled: a list of seconds."""
     compiled = []
 
     def heard(event, seconds, **_):
@@ -21,12 +26,57 @@ def test_a_new_number_is_no_new_program():
 
     jax.monitoring.register_event_duration_secs_listener(heard)
     try:
+        yield compiled
+    finally:
+        jax.monitoring.unregister_event_duration_listener(heard)
+
+
+def test_a_new_number_is_no_new_program():
+    """Issue 22: neither another parameter nor another guess is compiled for."""
+    find_orbit(gallery.StickSlip(), Motion(2.02, 0.0), period=13.54)
+    with compilations() as compiled:
         orbit = find_orbit(gallery.StickSlip(v_dr=0.25), Motion(2.0, 0.1), period=12.0)
         assert orbit.stable and not compiled
         jax.jit(lambda x: x + 3)(jnp.ones(7)).block_until_ready()
         assert compiled  # it would have been heard
-    finally:
-        jax.monitoring.unregister_event_duration_listener(heard)
+
+
+def test_results_are_read_without_a_program_for_each_operation():
+    """Issue 22: eager operations are programs too, of some 30 ms each. Events, prints and dense output need none, or
+    one."""
+    sol = nsjax.solve(gallery.StickSlip(), 0.0, 20.0, Motion(2.5, 0.0), saveat=diffrax.SaveAt(dense=True))
+    with compilations() as compiled:
+        assert len(list(sol.events)) == 3 and str(sol.events).count("belt") == 6
+        assert not compiled
+        one = sol(np.linspace(0, 20, 7))
+        assert len(compiled) <= 2
+        assert one.x.shape == (7,) and float(one.x[0]) == 2.5
+        count = len(compiled)
+        sol(np.linspace(1, 19, 7))
+        assert len(compiled) == count
+
+
+@pytest.mark.parametrize("key", ["3.4", "6.6"])
+def test_once_round_an_orbit_by_the_program_that_found_it(key, monkeypatch):
+    """A picture of an orbit that was found compiles no solution of its own; the solution is the same."""
+    given = gallery.entry(key)
+    period = {} if given.system().period is not None else dict(period=given.orbit.period)
+    orbit = find_orbit(given.system(), given.orbit.y0, **period)
+    own = orbit.solve()
+    monkeypatch.delattr(type(orbit), "solve")
+    sol = once_round(orbit)
+    ts = orbit.t0 + orbit.period * np.linspace(0, 1, 30)
+    for a, b in zip(sol(ts), own(ts)):
+        np.testing.assert_allclose(a, b, atol=1e-11)
+    np.testing.assert_allclose(sol.events.t[: len(sol.events)], own.events.t[: len(own.events)], rtol=1e-12)
+
+
+def test_a_point_on_a_surface_needs_its_mode():
+    """The program knows of no modes but those of relays: where the orbit slides, h alone does not say how it goes on."""
+    orbit = find_orbit(gallery.thesis("3.4"), Motion(2.02, 0.0), period=13.54)
+    stick = next(e for e in orbit.events if e.mode_after == {"belt": 0})
+    assert passage(orbit, stick.t, stick.y_after, (0,)) is not None  # attracted, so that it is the only way
+    assert passage(orbit, orbit.t0, orbit.y0, (0,)) is None
 
 
 class Rotor(nsjax.System):

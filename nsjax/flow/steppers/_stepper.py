@@ -56,12 +56,16 @@ def _dense_weights(solver_type: type, stages: int, x64: bool) -> tuple[np.ndarra
     """
     many = 16
     unit = np.eye(2 + stages)
-    with jax.ensure_compile_time_eval():
-        kwargs = dict(t0=0.0, t1=1.0, y0=jnp.asarray(unit[0]), y1=jnp.asarray(unit[1]))
+
+    @jax.jit  # one small program, where each operation would be one of its own
+    def evaluated(unit: Array, times: Array) -> Array:
+        kwargs: dict[str, Any] = dict(t0=0.0, t1=1.0, y0=unit[0], y1=unit[1])
         if stages:
-            kwargs["k"] = jnp.asarray(unit[2:])
-        path = solver_type.interpolation_cls(**kwargs)
-        values = np.stack([np.asarray(path.evaluate(jnp.asarray(u)), float) for u in nodes(many)])
+            kwargs["k"] = unit[2:]
+        return jax.vmap(solver_type.interpolation_cls(**kwargs).evaluate)(times)
+
+    with jax.ensure_compile_time_eval():
+        values = np.asarray(evaluated(jnp.asarray(unit), jnp.asarray(nodes(many))), float)
     chebyshev = np.linalg.lstsq(np.polynomial.chebyshev.chebvander(2 * nodes(many) - 1, many), values, rcond=None)[0]
     size = np.abs(chebyshev).max(axis=1)
     noise = (1e-10 if x64 else 1e-4) * size.max()
