@@ -11,11 +11,28 @@ import jax
 
 
 try:
-    from jax._src.core import trace_state_clean
+    from jax._src.core import EvalTrace, trace_ctx
+    from jax._src.interpreters.ad import JVPTrace
+    from jax._src.interpreters.batching import BatchTrace
 except ImportError:  # then nothing is known of the calls around this one
+    trace_ctx = None
 
-    def trace_state_clean() -> bool:
+MANY = 64  # lanes of a batch, from which on the faster program is worth the longer compilation
+
+
+def outermost() -> bool:
+    """Whether what is called now is compiled as a program of its own, and for one lane or few: nothing around it
+    collects a larger program. `jax.jvp`, `jax.jacfwd` and `jax.vmap` by themselves do not, they execute at once.
+    (`jax.linearize` keeps a program for later, which may become part of another one.)"""
+    if trace_ctx is None:
         return False
+    trace = trace_ctx.trace
+    while not isinstance(trace, EvalTrace):
+        few = isinstance(trace, BatchTrace) and trace.axis_data.size <= MANY
+        if not (few or isinstance(trace, JVPTrace)):
+            return False
+        trace = trace.parent_trace
+    return True
 
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -69,6 +86,6 @@ def interactive(fn: F, often: bool = False) -> F:
     def call(*args: Any, **kwargs: Any) -> Any:
         with without_collection():
             # The options can only be given to the outermost program.
-            return (alone() if trace_state_clean() else within)(*args, **kwargs)
+            return (alone() if outermost() else within)(*args, **kwargs)
 
     return cast(F, call)

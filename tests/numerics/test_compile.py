@@ -58,6 +58,33 @@ def test_options_are_given_to_the_outermost_program_only(monkeypatch, often, opt
         assert _compile._options(often) == options
 
 
+def test_what_is_outermost():
+    """What executes at once is in nobody's way; what is collected into another program, now or later, is."""
+    seen = []
+
+    def fn(x):
+        seen.append(_compile.outermost())
+        return jnp.sin(x)
+
+    x = jnp.ones(3)
+    fn(x), jax.jvp(fn, (x,), (x,)), jax.jacfwd(fn)(x), jax.vmap(fn)(x), jax.jacfwd(jax.jacfwd(fn))(x)
+    assert seen == [True] * 5
+    seen.clear()
+    jax.jit(fn)(x), jax.jit(jax.jacfwd(fn))(x), jax.linearize(fn, x), jax.vmap(fn)(jnp.ones(_compile.MANY + 1))
+    jax.lax.scan(lambda _, x: (None, fn(x)), None, x), jax.grad(lambda x: jnp.sum(fn(x)))(x)
+    assert seen == [False] * len(seen) and len(seen) >= 6
+
+
+def test_derivatives_called_directly_have_the_options(monkeypatch):
+    """And the linear part that `jax.linearize` keeps can be compiled within another program."""
+    fn = interactive(lambda x: jnp.sum(jnp.sin(x) ** 2))
+    x = jnp.arange(3.0)
+    np.testing.assert_allclose(jax.jacfwd(fn)(x), np.sin(2 * x), rtol=1e-14)
+    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(fn))(x), np.diag(2 * np.cos(2 * x)), rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(jax.vmap(jax.jacfwd(fn))(x[:, None]), np.sin(2 * x)[:, None], rtol=1e-14)
+    np.testing.assert_allclose(jax.jit(jax.linearize(fn, x)[1])(jnp.ones(3)), np.sum(np.sin(2 * x)), rtol=1e-14)
+
+
 def test_collection_is_restored():
     with pytest.raises(ZeroDivisionError), without_collection():
         assert not gc.isenabled()
