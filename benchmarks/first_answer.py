@@ -4,13 +4,15 @@
 
 Each row is a process of its own, without programs kept from before, measured `--repeats` times: seconds (median) of the
 import; of tracing, with all else that Python does once; of XLA's compiler (LLVM's for heyoka); of the same call again;
-and the ratio of what the first call takes to diffrax's derivative of a solution up to one event.
+the largest size of the process; and the ratio of what the first call takes to diffrax's derivative of a solution up to
+one event.
 """
 
 import argparse
 import json
 import os
 import pathlib
+import resource
 import subprocess
 import sys
 import time
@@ -53,24 +55,24 @@ def diffrax_event() -> Callable[[], Any]:
     return lambda: jax.block_until_ready(derivative(y))
 
 
-def solution(name: str, differentiated: bool) -> Callable[[], Any]:
-    """As a user's own program, or called directly."""
+def solution(name: str, how: str = "solve") -> Callable[[], Any]:
+    """`solve` called directly, its derivative called directly ("jacfwd"), or as a user's own program ("jit")."""
     import jax.numpy as jnp
     from systems import ThreeSurfaces
 
     import nsjax
-    from nsjax.gallery import Motion, thesis
+    from nsjax.gallery import entry, Motion, thesis
 
     jax = jax_ready()
-    if name == "three":
-        system = ThreeSurfaces()
-    else:
-        system = thesis("3.4")
-    y = Motion(jnp.asarray(2.5), jnp.asarray(0.0))
-    if not differentiated:
-        return lambda: jax.block_until_ready(nsjax.solve(system, 0.0, 10.0, y).y1)
-    derivative = jax.jit(jax.jacfwd(lambda y: nsjax.solve(system, 0.0, 10.0, y).y1))
-    return lambda: jax.block_until_ready(derivative(y))
+    system = ThreeSurfaces() if name == "three" else thesis(name)
+    start = entry(name).y0 if name == "A.9" else Motion(2.5, 0.0)
+    y = jax.tree.map(jnp.asarray, start)
+
+    def end(y: Any) -> Any:
+        return nsjax.solve(system, 0.0, 10.0, y).y1
+
+    called = {"solve": end, "jacfwd": jax.jacfwd(end), "jit": jax.jit(jax.jacfwd(end))}[how]
+    return lambda: jax.block_until_ready(called(y))
 
 
 def orbit(section: str) -> Any:
@@ -146,10 +148,15 @@ def scipy_event() -> Callable[[], Any]:
 
 ROWS: dict[str, Callable[[], Callable[[], Any]]] = {
     UNIT: diffrax_event,
-    "nsjax: solve, one sgn switch": lambda: solution("3.4", False),
-    "nsjax: jit(jacfwd(solve)), one sgn switch": lambda: solution("3.4", True),
-    "nsjax: solve, three switches": lambda: solution("three", False),
-    "nsjax: jit(jacfwd(solve)), three switches": lambda: solution("three", True),
+    "nsjax: solve, one sgn switch": lambda: solution("3.4"),
+    "nsjax: jacfwd(solve), one sgn switch": lambda: solution("3.4", "jacfwd"),
+    "nsjax: jit(jacfwd(solve)), one sgn switch": lambda: solution("3.4", "jit"),
+    "nsjax: solve, three switches": lambda: solution("three"),
+    "nsjax: jacfwd(solve), three switches": lambda: solution("three", "jacfwd"),
+    "nsjax: jit(jacfwd(solve)), three switches": lambda: solution("three", "jit"),
+    "nsjax: solve, drillstring (five states, three switches)": lambda: solution("A.9"),
+    "nsjax: jacfwd(solve), drillstring": lambda: solution("A.9", "jacfwd"),
+    "nsjax: jit(jacfwd(solve)), drillstring": lambda: solution("A.9", "jit"),
     "nsjax: find_orbit, 3.4": lambda: found("3.4"),
     "nsjax: find_orbit, 6.6": lambda: found("6.6"),
     "nsjax: find_orbit and continue_orbit, 6.6": branch,
@@ -183,7 +190,9 @@ def measured(name: str) -> dict[str, float]:
     again = min(times[1:])
     if name.startswith("heyoka"):  # every new integrator is compiled
         compiling, again = times[0], again if again < 0.5 * times[0] else 0.0
-    return dict(imports=imported, traces=times[0] - compiling - again, compiles=compiling, again=again, first=times[0])
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    traces = times[0] - compiling - again
+    return dict(imports=imported, traces=traces, compiles=compiling, again=again, first=times[0], memory=memory)
 
 
 def main() -> None:
@@ -198,7 +207,7 @@ def main() -> None:
         return
     environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     table: dict[str, dict[str, float]] = {}
-    print("| | import | trace | compile | again | first call | ratio |\n|---|---|---|---|---|---|---|")
+    print("| | import | trace | compile | again | MB | first call | ratio |\n|---|---|---|---|---|---|---|---|")
     for name in args.rows:
         runs = []
         for _ in range(args.repeats):
@@ -210,12 +219,13 @@ def main() -> None:
                 raise SystemExit(f"{name} failed:\n{done.stderr}")
             runs.append(json.loads(done.stdout.splitlines()[-1]))
         if not runs:
-            print(f"| {name} | not installed | | | | | |", flush=True)
+            print(f"| {name} | not installed | | | | | | |", flush=True)
             continue
         table[name] = row = {k: float(np.median([run[k] for run in runs])) for k in runs[0]}
         ratio = row["first"] / table[UNIT]["first"] if UNIT in table else float("nan")
         cells = [f"{row[k]:.2f}" for k in ("imports", "traces", "compiles")] + [f"{row['again']:.3f}"]
-        print(f"| {name} | {' | '.join(cells)} | {row['first']:.2f} | {ratio:.1f} |", flush=True)
+        cells += [f"{row['memory']:.0f}", f"{row['first']:.2f}", f"{ratio:.1f}"]
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
     if args.out:
         args.out.write_text(json.dumps(table, indent=1) + "\n")
 

@@ -162,7 +162,7 @@ def chain_starts(n):
 
 
 @pytest.mark.parametrize("n", [5, pytest.param(10, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("start", ["mixed", "slipping", "sticking", "mirrored"])
+@pytest.mark.parametrize("start", [pytest.param("mixed", marks=pytest.mark.slow), "slipping", "sticking", "mirrored"])
 def test_many_blocks(start, n):
     """Pitfalls 6, 7, 32: against matrix exponentials; the order of blocks and switches does not matter; and energy is
     what the work of friction leaves of it."""
@@ -246,6 +246,7 @@ def greedy(A, p):
         s[worst] = np.sign(lam[worst])
 
 
+@pytest.mark.slow
 def test_stack_of_surfaces():
     """Pitfall 34: 300 stacks on which three surfaces are met at once; on some, releasing alone gives a wrong mode."""
     rng = np.random.default_rng(3)

@@ -31,6 +31,7 @@ def table():
     return work_precision(SYSTEM, end, METHODS, (1e-6, 1e-10), repeats=2, count=True)
 
 
+@pytest.mark.slow
 def test_errors_are_true(table):
     """Those of the event-driven method fall with the tolerance, those of the band do not; the reference agrees with the
     closed form."""

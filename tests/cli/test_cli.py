@@ -98,6 +98,7 @@ def test_orbit_of_the_model_in_the_readme(tmp_path):
     check_stick_slip_orbit(numbers["orbit"])
 
 
+@pytest.mark.slow
 def test_impacts_accumulate_to_rest(tmp_path):
     status, out, err = run("run", "1.1(3)", "--y0", "x=0.5", "--out", tmp_path, "--json", "-")
     simulation = json.loads(out)["simulation"]

@@ -163,10 +163,10 @@ def test_infinitely_unstable_fold():
         (dict(interval=(3.0, 4.0)), "within `interval`"),
     ],
 )
-def test_mistakes(duffing, change, message):
-    arguments = dict(parameter="omega", interval=(0.9, 2.2)) | change
+def test_mistakes(walls, change, message):
+    arguments = dict(parameter="omega", interval=(0.1, 1.5)) | change
     with pytest.raises(ValueError, match=message):
-        continue_orbits(duffing[0], **arguments)
+        continue_orbits(walls[0], **arguments)
 
 
 def test_printed(walls):

@@ -136,6 +136,7 @@ def test_repulsion_sliding_does_not_drift():
     assert list(s.itinerary) == [{"surface": 0}]
 
 
+@pytest.mark.slow
 def test_repulsion_sliding_stays():
     """Pitfall 24: what steps off the surface is put back, on a circle too (it repels backwards in time), and what the
     start was off it is not in the derivative."""

@@ -148,6 +148,7 @@ class Curved(nsjax.System):
         return y[1] - y[0] ** 2 - 0.5 * y[2] ** 2
 
 
+@pytest.mark.slow
 def test_derivatives_of_eigenvalues_on_a_curved_surface():
     def roots(p):
         guess = jnp.array([0.3, 0.1, 0.0])

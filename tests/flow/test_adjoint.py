@@ -63,7 +63,8 @@ def test_surface_that_is_all_but_reached():
     np.testing.assert_allclose(slope(lanes), np.sin(4.0), atol=1e-4)
 
 
-@pytest.mark.parametrize("adjoint", ["jacobian", pytest.param("checkpoint", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", ["jacobian", "checkpoint"])
 def test_lanes(forward, adjoint):
     """Pitfall 18: under `vmap` the event's branch is run by lanes that have no event."""
     points = POINT + jnp.arange(3.0)[:, None] * jnp.array([0.0, 0.01, 0.0, 0.1, 0.0])

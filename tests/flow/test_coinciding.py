@@ -132,7 +132,8 @@ def lane(sol, x):
     return jax.tree.map(lambda a: a[len(STARTS) + BELOW.index(x)], eqx.filter(sol, eqx.is_array))
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("three", "five"))) for n in GROUPS])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", GROUPS)
 def test_elements_that_move_as_one(name):
     """Same events at the same times, one of them for all elements; same motion; and as unique."""
     many, one = group(name, a=0.4)

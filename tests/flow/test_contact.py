@@ -59,6 +59,7 @@ class Flat(nsjax.System):
         return self.e
 
 
+@pytest.mark.slow
 def test_state_in_one_array():
     """That dh/dt is no function of the contact force is seen entry by entry."""
     sol = solve(Flat(jnp.eye(1) / 2), 0.0, 5.0, jnp.array([1.0, 0.0]))
@@ -118,6 +119,7 @@ def test_lift_off():
     np.testing.assert_allclose(derivative, [-(free**2) / 2, -free], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_ball_on_an_oscillating_table():
     """Pitfalls 14, 16: against 40 digits, the times of landing, rest, lift-off and the next landing."""
     ref = reference.ball_on_table()
@@ -134,6 +136,7 @@ def test_ball_on_an_oscillating_table():
     assert resting.sum() > 3 and np.max(np.abs(gap)) < 1e-14
 
 
+@pytest.mark.slow
 def test_ball_on_a_table_late():
     """Pitfalls 16, 28: after 1e6 time units flights are not taken for short because the time is long."""
     ref = reference.ball_on_table()
@@ -263,6 +266,7 @@ class Stack(nsjax.System):
         return self.e
 
 
+@pytest.mark.slow
 def test_two_contacts():
     """The lower ball lands and rests, then the upper one on it; both stay, without drift."""
     sol = solve(Stack(), 0.0, 1000.0, Thrown(0.5, 1.0, 0.0, 0.0), **TIGHT)
@@ -289,6 +293,7 @@ class Relaxed(nsjax.System):
         return 0.0
 
 
+@pytest.mark.slow
 def test_rest_without_force():
     """After a plastic impact nothing moves and no force acts, apart from their rounding, whatever its sign."""
 
@@ -406,7 +411,7 @@ def test_start_by_mode():
         solve(Glue(), 0.0, 1.0, Motion(1.0, 0.0))
 
 
-@pytest.mark.parametrize("mu", [0.3, pytest.param(1.5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mu", [pytest.param(0.3, marks=pytest.mark.slow), pytest.param(1.5, marks=pytest.mark.slow)])
 def test_friction_of_an_open_contact(mu):
     """Pitfall 43: in flight there is no friction, so that the sliding velocity passes through zero and does not stick;
     on the floor there is, and the impact takes its share of it."""

@@ -63,6 +63,7 @@ def test_derivatives_at_the_ends(sol):
         np.testing.assert_allclose(jax.jacfwd(lambda t: sol(t).x)(t), sol(t).v, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_batches_are_evaluated_lane_by_lane():
     sols = jax.vmap(lambda x: nsjax.solve(BELT, 0.0, 4.0, Motion(x, 0.0 * x), saveat=dfx.SaveAt(dense=True)))(
         jnp.asarray([2.0, 2.5])
@@ -110,7 +111,11 @@ class Ramp(nsjax.System):
 
 
 @pytest.mark.parametrize(
-    "solver", [dfx.Tsit5(), pytest.param(dfx.Dopri8(), marks=pytest.mark.slow), nsjax.Taylor(), nsjax.Exponential()]
+    "solver",
+    [
+        dfx.Tsit5(),
+        *(pytest.param(s, marks=pytest.mark.slow) for s in (dfx.Dopri8(), nsjax.Taylor(), nsjax.Exponential())),
+    ],
 )
 def test_events_at_the_end(solver):
     """Issue 20.13, pitfall 9: an event exactly at the end is logged, and the end moves with the time that is asked for."""
@@ -127,6 +132,7 @@ def test_events_at_the_end(solver):
     assert early[0] == 0 and early[1] == -1
 
 
+@pytest.mark.slow
 def test_orbit_based_on_an_event():
     """Issue 20.5, pitfall 44: with its base point exactly where it stops sticking, an orbit has the multipliers that it
     has elsewhere."""

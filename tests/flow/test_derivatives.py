@@ -85,6 +85,7 @@ def test_errors_fall_with_the_tolerance(solver, order, exact):
         assert abs(slope - 1) < 0.1 and by_steps < -order
 
 
+@pytest.mark.slow
 def test_vmap_and_jacfwd_commute():
     """Also at different numbers of events in different lanes; pitfalls 17, 18."""
     speeds = jnp.linspace(0.2, 0.9, 6)
@@ -128,6 +129,7 @@ def test_times_of_start_and_end():
     np.testing.assert_allclose(found, want, atol=1e-8 * np.abs(want).max())
 
 
+@pytest.mark.slow
 def test_second_derivatives():
     """Pitfall 20: not silently wrong, across stick and slip."""
 
@@ -228,6 +230,7 @@ def test_second_derivatives_by_closed_forms(name):
         np.testing.assert_allclose(found, want, rtol=tol, atol=tol)
 
 
+@pytest.mark.slow
 def test_two_surfaces():
     """Through sliding on one surface, on two, and the tangential exit: closed form, see `test_flow.pair_exact`."""
 
@@ -268,6 +271,7 @@ def test_saved_states_within_a_step_to_an_event():
         np.testing.assert_allclose(within[:, i], ends(p, t)[:, 0], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_derivative_of_what_failed():
     """Pitfall 16: who asks for the derivative alone is told too, in forward mode and in reverse."""
 

@@ -139,6 +139,7 @@ def rings():
     return jax.jit(jax.vmap(run))(10.0 ** jnp.asarray([0.0, -12.0, 12.0, 0.0]), jnp.asarray([3.0, 3.0, 3.0, 1000.0]))
 
 
+@pytest.mark.slow
 def test_scale_of_a_surface_that_is_not_affine(rings):
     """Pitfall 27: a polynomial stands for h to a fraction of h, whatever its unit."""
     assert np.all(rings.result == RESULTS.successful) and np.all(rings.events.num == 1)
@@ -216,6 +217,7 @@ def test_reset_without_an_inverse_is_not_run_backwards():
         jax.jit(lambda t1: solve(Valve(), 1.0, t1, Motion(1.0, 0.0)).y1)(0.0)
 
 
+@pytest.mark.slow
 def test_support():
     """Section 3.5: a surface with a corner, entered at x = x_c and left at vanishing contact force."""
     for omega, y0 in ((1.4, (1.0, 0.3)), (0.6, (-2.0, 1.0))):
@@ -311,6 +313,7 @@ def test_repulsion_sliding():
         assert len(sol.events) == 0 and sol.mode1[0] == mode
 
 
+@pytest.mark.slow
 def test_points_of_one_dimension():
     """(2.3), examples 2.4 and 2.5: rest at x = 0; leave it; stay on it if told to."""
     line = type(gallery.THESIS["(2.3)"].y0)

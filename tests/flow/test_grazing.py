@@ -37,7 +37,7 @@ def test_just_missing(gap):
         np.testing.assert_allclose(y, [np.cos(3), -np.sin(3)], atol=1e-10)
 
 
-@pytest.mark.parametrize("gap", [-1e-4, -1e-8])
+@pytest.mark.parametrize("gap", [pytest.param(-1e-4, marks=pytest.mark.slow), -1e-8])
 def test_just_touching(gap):
     """Pitfall 10: an impact with a speed of 1.4e-2 or 1.4e-4, and its derivative of 60 or 6000."""
     y, result, events = run(Touch(gap))

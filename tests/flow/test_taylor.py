@@ -250,6 +250,7 @@ def test_end_of_the_field(c, results):
     np.testing.assert_allclose(sol.t1, max(c, 0.0), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_single_precision():
     y0 = Motion(jnp.float32(2.5), jnp.float32(-0.5))
     system = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), gallery.StickSlip(v_dr=0.5))

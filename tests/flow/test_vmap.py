@@ -149,6 +149,7 @@ def test_every_lane_has_its_own_result():
     np.testing.assert_allclose(last[1], 3 * np.sqrt(2), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_map_in_batches_and_nested_vmap():
     v, x = lanes(64)
     batch = many()(v, x)

@@ -295,6 +295,7 @@ def lap(phi, omega):
     return t + back, phi
 
 
+@pytest.mark.slow
 def test_stick_slip_without_stick():
     """Fig. A.7a: at ω = 2 slip forwards and backwards alone. scipy's orbit by fixed-point iteration."""
     guess = gallery.entry("A.8").orbit
@@ -310,9 +311,8 @@ def test_stick_slip_without_stick():
 BACKWARDS = 0.7422889477650  # where slip backwards appears; as the next test finds it
 
 
-@pytest.mark.parametrize(
-    "omega, low, high", [(0.77, 0.72, 0.78), pytest.param(0.72, 0.71, 0.77, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("omega, low, high", [(0.77, 0.72, 0.78), (0.72, 0.71, 0.77)])
 def test_the_corner_where_slip_backwards_appears(omega, low, high):
     """Pitfall 25: seen from either side. A segment that returns to its surface vanishes, beside orbits on which it has
     no duration anyway; and a surface can only just hold what comes onto it. The branch goes on."""

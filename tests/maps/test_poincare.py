@@ -55,6 +55,7 @@ def loose_tops(v_dr, x):
 # Sections.
 
 
+@pytest.mark.slow
 def test_oscillator_from_maximum_to_maximum():
     """Pitfalls 1, 2: a start on the section is no return, and no iterate is found twice."""
     many = tops(Oscillator(), 2.0, iterates=5)
@@ -134,6 +135,7 @@ def test_derivative_is_6_7(orbit):
         np.testing.assert_allclose((4 * soon - 3 * time - late) / (2 * h[i]), by_t[i], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradient():
     def image(x, zeta):
         return tops(Oscillator(zeta=zeta), x, number=2, adjoint=dfx.DirectAdjoint()).y.x
@@ -345,7 +347,9 @@ def phase(t, y):
     return jnp.sin(0.8 * t)
 
 
-@pytest.mark.parametrize("e, b", [pytest.param(0.8, 0.0, marks=pytest.mark.slow), (0.0, -2.0)])
+@pytest.mark.parametrize(
+    "e, b", [pytest.param(0.8, 0.0, marks=pytest.mark.slow), pytest.param(0.0, -2.0, marks=pytest.mark.slow)]
+)
 def test_a_phase_of_the_forcing_is_a_section(e, b):
     """Also of a mass that rests on the wall all the time, in its mode."""
     system, y0 = ForcedHammer(e=e, b=b), Motion(1.0, 0.0)
@@ -473,6 +477,7 @@ def belt_diagram():
     return brute_force(BELT, "omega", jnp.asarray([1.65, 1.68, 1.69, 1.8]), Motion(1.0, 0.0), transient=300, keep=40)
 
 
+@pytest.mark.slow
 def test_brute_force_in_section_6_9(belt_diagram):
     """Period 2 on the branches I and III, and the chaos between B and C; the points are those of the exact orbit."""
     assert belt_diagram.periods()[:, 0].tolist() == [2, 2, 0, 2]

@@ -74,6 +74,7 @@ def test_a_model_may_be_built_as_a_scene():
         nsjax.solve(Blocks(m=-1.0), 0.0, 1.0, y0)
 
 
+@pytest.mark.slow
 def test_a_sweep_over_a_parameter():
     def end(v):
         scene = eqx.tree_at(lambda scene: scene.belt.v, BELT, v)
@@ -94,6 +95,7 @@ def test_a_scene_may_be_batched():
     assert slope.spring.k == -2.0 and slope.belt.v == 0.0
 
 
+@pytest.mark.slow
 def test_a_scene_is_smoothed_and_banded():
     rubbing = Scene({"x": 1.0}, spring=Spring("x", k=1.0), rub=Friction("x", Coulomb(0.3), v=0.2))
     y0 = rubbing.state({"x": 1.0})

@@ -31,7 +31,9 @@ TIGHT = dict(solver=dfx.Dopri8(), stepsize_controller=dfx.PIDController(rtol=1e-
 BELT, HAND, START = TWINS["belt"]
 
 
-@pytest.mark.parametrize("name", TWINS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("support", "chain"))) for n in TWINS]
+)
 def test_a_scene_moves_as_the_model_by_hand(name):
     scene, hand, y = TWINS[name]
     start = jax.tree.unflatten(jax.tree.structure(scene.state()), jax.tree.leaves(y))
@@ -76,6 +78,7 @@ def stitched(fields, guards, y, t1):
     return y
 
 
+@pytest.mark.slow
 def test_a_one_sided_support_against_scipy():
     """Contact begins at the gap, and ends where the force vanishes, before the gap opens (section 3.5)."""
     scene, _, _ = TWINS["support"]
@@ -93,6 +96,7 @@ def test_a_one_sided_support_against_scipy():
     np.testing.assert_allclose([sol.y1.q.x, sol.y1.v.x], expected, rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_trilinear_spring_against_scipy():
     """Section 6.6 without damping in the stiff part, where the force is continuous."""
     scene = Scene(
@@ -144,7 +148,7 @@ def test_a_mass_matrix_that_depends_on_the_state():
         np.testing.assert_allclose(jax.tree.leaves(found), by_hand(0.0, y), rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize("solver", [dfx.Dopri8(), nsjax.Taylor()])
+@pytest.mark.parametrize("solver", [dfx.Dopri8(), pytest.param(nsjax.Taylor(), marks=pytest.mark.slow)])
 def test_a_pendulum_on_a_cart_keeps_its_energy(solver):
     y0 = CART.state({"phi": 2.0}, {"x": 0.5, "phi": 1.0})
     tight = TIGHT | dict(solver=solver)
@@ -194,6 +198,7 @@ def test_two_frictions_on_one_velocity_are_solved_together():
     np.testing.assert_allclose(shares, [0.5, 1.0], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_stop_that_is_at_rest_at_the_start():
     """A ball on the floor stays there; with friction in the contact it slows down by μ g."""
     scene = Scene(

@@ -94,7 +94,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", [pytest.param(c, marks=[pytest.mark.slow] * (c != "autonomous")) for c in CASES])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
 def test_one_program_finds_the_same(case):
     """The search within `jax.jit`, one program of its own, has the same base point, period, multipliers and events; its
     multipliers come from saltation matrices, and not from the derivative of the flow."""

@@ -58,6 +58,7 @@ def test_infinitely_unstable():
     assert [len(orbits), *map(int, np.isinf(orbits[0].multipliers))] == [1, 1, 0]
 
 
+@pytest.mark.slow
 def test_none():
     far = Motion(jnp.array([0.01, 0.02]), jnp.array([0.0, 0.01]))
     assert find_orbits(Rings(), far, period=6.2, **METHOD) == []

@@ -65,7 +65,7 @@ def check_stick_slip(orbit, exact, **parameters):
     assert orbit.stable
 
 
-@pytest.mark.parametrize("c", [0.0, 0.1])
+@pytest.mark.parametrize("c", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_sections_3_4_and_6_7(classic, c):
     orbit = classic if c == 0 else find_orbit(gallery.StickSlip(c=c), Motion(2.0, 0.0), period=12.635, **METHOD)
     check_stick_slip(orbit, reference.stick_slip_orbit(c=c))
@@ -90,6 +90,7 @@ def test_other_solvers(classic, solver, method):
     np.testing.assert_allclose(orbit.multipliers, [1, 0], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_section_2_4():
     orbit = find_orbit(gallery.FallingStickSlip(), Motion(1.1, 0.0), period=12.0, **METHOD)
     check_stick_slip(orbit, reference.friction_curve_orbit())
@@ -130,6 +131,7 @@ def test_period_is_found(classic):
     np.testing.assert_allclose(orbit.period, classic.period, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_solution_over_several_periods(classic):
     sol = classic.solve(periods=2)
     np.testing.assert_allclose([sol.y1.x, sol.y1.v], [classic.y0.x, classic.y0.v], atol=1e-9)
@@ -347,6 +349,7 @@ def test_reverse_mode():
         amplitude(p, dfx.RecursiveCheckpointAdjoint())
 
 
+@pytest.mark.slow
 def test_fit_by_optimistix():
     """Least squares need `jax.linearize`: damping and frequency from a state of the orbit."""
     options = METHOD | dict(stepsize_controller=pid(1e-10), adjoint=dfx.DirectAdjoint(), throw=False)
@@ -567,6 +570,7 @@ def test_a_continuum_is_named(system, guess, y0):
     assert orbit.result == RESULTS.orbit_sticks_for_ever and not bool(nsjax.is_okay(orbit.result))
 
 
+@pytest.mark.slow
 def test_an_equilibrium_that_slides_is_no_continuum():
     """x' = -x on the surface y = 0 of y' = -sgn y: one point alone."""
 

@@ -124,7 +124,7 @@ class Decay(nsjax.System):
         return -self.k * y + self.c * jnp.ones_like(y)
 
 
-@pytest.mark.parametrize("exact", [True, False])
+@pytest.mark.parametrize("exact", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_tangents_of_the_model(exact):
     """The derivative by a parameter is a tangent of the model, and no column is carried for what has none."""
     y, t = jnp.array([1.3]), jnp.asarray(2.0)

@@ -233,6 +233,7 @@ def area(polygon):
     return abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
 
 
+@pytest.mark.slow
 def test_perturbation_tube():
     orbit = stable()
     ax = plot.perturbation_tube(orbit, radius=(0.1, 0.05), labels={"x": "x [m]", "v": "v [m/s]"})
@@ -323,6 +324,7 @@ def test_multipliers_of_several_orbits():
         plot.multipliers(failed)
 
 
+@pytest.mark.slow
 def test_bifurcation_diagram():
     """Stable and unstable stretches end where they should; points are named; orbits are grey."""
     system = gallery.Hopf(-1.0)

@@ -315,6 +315,7 @@ def test_arrays():
         system.vector_field(0.0, Nodes(jnp.zeros(3), jnp.ones(2)), system.values((1.0,) * 3))
 
 
+@pytest.mark.slow
 def test_single_precision():
     system = mark_kinks(Support(), Motion(jnp.float32(1.0), jnp.float32(0.0)))
     sol = solve(system, 0.0, 5.0, Motion(jnp.float32(1.0), jnp.float32(0.0)), solver=dfx.Heun())

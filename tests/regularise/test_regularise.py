@@ -60,7 +60,12 @@ def falling(name):
 
 @pytest.mark.parametrize(
     "name, order",
-    [pytest.param("arctan", 0.6, marks=SLOW), pytest.param("tanh", 0.9, marks=SLOW), ("linear", 1), ("banded", 1)],
+    [
+        pytest.param("arctan", 0.6, marks=SLOW),
+        pytest.param("tanh", 0.9, marks=SLOW),
+        pytest.param("linear", 1, marks=SLOW),
+        ("banded", 1),
+    ],
 )
 def test_order_on_falling_friction(name, order):
     """Section 2.4. First order, but for the tails of the arctangent: where a stick ends with h ~ t² they pull the

@@ -114,6 +114,7 @@ class Rubbing(nsjax.System):
         return Motion(y.v, -self.k * y.x - friction)
 
 
+@pytest.mark.slow
 def test_blocks_that_know_nothing_of_each_other():
     """Six at once, more than are tried in all their modes, two of them the same: each is what it is alone, also where
     both are at their surfaces at one instant."""
