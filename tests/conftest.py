@@ -27,11 +27,34 @@ matplotlib.use("Agg")
 gc.set_threshold(100_000, 20, 20)  # tracing makes many objects, and looking through them takes a fifth of its time
 
 
-@pytest.fixture(autouse=True, scope="module")
-def forgotten():
-    """Programs of one file are of no use to the next, and all of them together take some ten gigabytes."""
-    yield
+MOST = 1.2e9  # bytes of a process, from which on it forgets between two tests of a file too
+
+
+def forget():
+    """Drops compiled programs: all of them together take some ten gigabytes."""
     jax.clear_caches()
     gc.collect()
     if sys.platform == "linux":  # which keeps what was freed, until it is told not to
         ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
+def size():
+    """Of this process, in bytes, where that is cheap to know."""
+    if sys.platform != "linux":
+        return 0
+    return int(pathlib.Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forgotten():
+    """Programs of one file are of no use to the next."""
+    yield
+    forget()
+
+
+@pytest.fixture(autouse=True)
+def bounded():
+    """Some files have more programs than fit."""
+    yield
+    if size() > MOST:
+        forget()

@@ -61,12 +61,10 @@ def find_equilibrium(
     """
     system, y0, t, given, tol = checked_equilibrium(system, y0, t, mode, tol)
     model = SwitchedSystem.forwards(system, t, y0)
-    names = [k.name for k in system.switches]
-    chosen = model.present(tuple(given.get(n, m) for n, m in zip(names, _mode_of(model, t, y0))))
     newton = Newton(tol, max_iterations)
-    found = equilibrium_in(system, t, y0, chosen, newton)
+    found = equilibrium_in(system, t, y0, _chosen(system, t, y0, given), newton)
     concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, y0)))
-    if concrete and len(given) < len(names) and not (found.result == RESULTS.successful and found.admissible):
+    if concrete and len(given) < len(system.switches) and not (found.result == RESULTS.successful and found.admissible):
         others = _in_all_modes(system, model, t, jax.tree.map(lambda x: x[None], y0), given, newton)
         others = [other for other in others if other.admissible]
         if others:
@@ -138,6 +136,14 @@ def _options(model: SwitchedSystem, given: dict[str, Any]) -> list[tuple[int, ..
             free = (0,)
         options.append((int(given[switch.name]),) if switch.name in given else free)
     return options
+
+
+@interactive
+def _chosen(system: System, t: Any, y: Y, given: dict[str, Any]) -> tuple:
+    """The mode that is given, and what is not given of it by the state."""
+    model = SwitchedSystem.forwards(system, t, y)
+    modes = zip([k.name for k in system.switches], _mode_of(model, t, y))
+    return model.present(tuple(jnp.asarray(given.get(name, mode), jnp.int32) for name, mode in modes))
 
 
 def _mode_of(model: SwitchedSystem, t: Any, y: Y) -> list[Any]:
