@@ -204,8 +204,8 @@ def _write_json(args: argparse.Namespace, job: Job, numbers: Callable[[], dict[s
 
 
 def _list() -> int:
-    width = max(map(len, gallery.THESIS))
-    for key, entry in gallery.THESIS.items():
+    width = max(map(len, gallery.SYSTEMS))
+    for key, entry in gallery.SYSTEMS.items():
         print(f"{key:{width}}  {entry.title}{'' if entry.orbit is None else ' (with a periodic orbit)'}")
     return 0
 

@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterable, Mapping
 from types import ModuleType
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from .. import gallery
-from .._numerics._text import nearest
+from .._numerics._text import components, nearest
 from .._types import Y
 from ..system._system import System
 
@@ -108,21 +109,27 @@ def load(name: str, parameters: Mapping[str, str], y0: str | None) -> Job:
     except ValueError:
         raise _unknown_system(name) from None
     system = _make(entry.system, dataclasses.fields(entry.system()), parameters)
-    start = entry.y0 if y0 is None else _state(y0, type(entry.y0), entry.y0._asdict())
-    return Job(entry.key, entry.title, system, _arrays(start), entry.y0._fields, entry.t0, entry.t1, entry.orbit, True)
+    if y0 is None:
+        start = entry.y0
+    elif any(isinstance(part, tuple) for part in entry.y0):  # that of a scene: q.x, v.x
+        start = _part_of(entry.y0, y0)
+    else:
+        start = _state(y0, type(entry.y0), entry.y0._asdict())
+    names = tuple(components(entry.y0))
+    return Job(entry.key, entry.title, system, _arrays(start), names, entry.t0, entry.t1, entry.orbit, True)
 
 
 def _unknown_system(name: str) -> UsageError:
     """Keys may be meant, or what the gallery calls its systems; or a file."""
     if pathlib.Path(f"{name}.py").is_file():
         return UsageError(f"There is no system {name!r}. Did you mean {name}.py?")
-    called = {key: key for key in gallery.THESIS}
-    for key, entry in gallery.THESIS.items():
+    called = {key: key for key in gallery.SYSTEMS}
+    for key, entry in gallery.SYSTEMS.items():
         for words in (type(entry.system()).__name__, entry.title):
             called.setdefault(words, key)
     near = nearest(name, called)
     meant = "" if near is None else f" Did you mean {called[near]} ({gallery.entry(called[near]).title})?"
-    keys = ", ".join(gallery.THESIS)
+    keys = ", ".join(gallery.SYSTEMS)
     return UsageError(f"There is no system {name!r}.{meant} Possible: {keys}; or a file of yours, model.py:ClassName.")
 
 
@@ -265,10 +272,17 @@ def _state(text: str, cls: Any, defaults: Mapping[str, Any]) -> Any:
     return cls(**values)
 
 
+def _part_of(default: Any, text: str) -> Any:
+    """A nested state with some of its numbers replaced, by names such as `q.x`."""
+    names, (leaves, tree) = list(components(default)), jax.tree.flatten(default)
+    for pair in text.split(","):
+        name, equals, value = (part.strip() for part in pair.partition("="))
+        if not equals or name not in names:
+            raise unknown("state", name, names)
+        leaves[names.index(name)] = _number(value, f"Component {name}")
+    return jax.tree.unflatten(tree, leaves)
+
+
 def _arrays(state: Any) -> Any:
     """The leaves as arrays, lists of numbers too."""
-    if isinstance(state, dict):
-        return {name: jnp.asarray(value, float) for name, value in state.items()}
-    if isinstance(state, tuple):
-        return type(state)(*(jnp.asarray(value, float) for value in state))
-    return state
+    return jax.tree.map(lambda x: jnp.asarray(x, float), state, is_leaf=lambda x: isinstance(x, list))

@@ -1,14 +1,29 @@
-"""Every system of Leine's thesis (2000), ready to run.
+"""Every system of Leine's thesis (2000), ready to run, and some beyond it.
 
-`thesis("6.6")` is the system of section 6.6 with the values of Appendix C; `THESIS` lists them all.
+`thesis("6.6")` is the system of section 6.6 with the values of Appendix C; `THESIS` lists them all. `APPLICATIONS` are
+systems beyond the thesis, each with a number that is known of it: `BrakePad`, `Neuron`, ...
 """
 
+from ._applications import (
+    APPLICATIONS as APPLICATIONS,
+    BlockChain as BlockChain,
+    BrakePad as BrakePad,
+    BuckConverter as BuckConverter,
+    Charge as Charge,
+    Clutch as Clutch,
+    GearPair as GearPair,
+    Neuron as Neuron,
+    Pad as Pad,
+    Potential as Potential,
+    RelayServo as RelayServo,
+)
 from ._block import (
     FallingFrictionBlock as FallingFrictionBlock,
     Slip as Slip,
     SmoothBlock as SmoothBlock,
     StaticPointBlock as StaticPointBlock,
 )
+from ._catalogue import entry as entry, SYSTEMS as SYSTEMS, thesis as thesis
 from ._drillstring import (
     DrillstringModel as DrillstringModel,
     DrillstringScene as DrillstringScene,
@@ -19,6 +34,7 @@ from ._drillstring import (
     WhirlModel as WhirlModel,
     WhirlScene as WhirlScene,
 )
+from ._entry import Entry as Entry, OrbitGuess as OrbitGuess
 from ._examples import (
     AttractionSliding as AttractionSliding,
     Line as Line,
@@ -53,4 +69,4 @@ from ._motion import Motion as Motion
 from ._stick_slip import FallingStickSlip as FallingStickSlip, StickSlip as StickSlip
 from ._support import DiscontinuousSupport as DiscontinuousSupport, Trilinear as Trilinear
 from ._table11 import BouncingBall as BouncingBall, DryFriction as DryFriction, ElasticSupport as ElasticSupport
-from ._thesis import Entry as Entry, entry as entry, OrbitGuess as OrbitGuess, THESIS as THESIS, thesis as thesis
+from ._thesis import THESIS as THESIS

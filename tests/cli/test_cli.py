@@ -429,7 +429,7 @@ def test_advice_names_options(result, words):
 def test_list_names_every_system():
     status, out, _ = run("list")
     assert status == 0
-    assert [re.split(r"  +", line)[0] for line in out.splitlines()] == list(gallery.THESIS)
+    assert [re.split(r"  +", line)[0] for line in out.splitlines()] == list(gallery.SYSTEMS)
 
 
 def test_a_list_that_nobody_reads_to_its_end(monkeypatch):

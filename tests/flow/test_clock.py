@@ -17,43 +17,7 @@ from scipy.optimize import brentq
 import nsjax
 from nsjax import RESULTS
 from nsjax._numerics._jaxpr import is_affine, may_jump
-
-
-class Charge(NamedTuple):
-    v: Array  # [V]
-    i: Array  # [A]
-
-
-class Buck(nsjax.System):
-    """A voltage-controlled buck converter with the values of Hamill and Deane (1992): the switch conducts while the
-    control voltage lies below a sawtooth."""
-
-    R: float = 22.0
-    L: float = 20e-3
-    C: float = 47e-6
-    V_in: float = 22.0
-    V_ref: float = 11.3
-    gain: float = 8.4
-    V_low: float = 3.8
-    V_high: float = 8.2
-    T: float = 400e-6
-
-    def vector_field(self, t, y, s):
-        conducts = 0.5 * (1 - s.comparator)
-        return Charge((y.i - y.v / self.R) / self.C, (self.V_in * conducts - y.v) / self.L)
-
-    @nsjax.clock
-    def carrier(self):
-        return self.T
-
-    @nsjax.sgn
-    def comparator(self, t, y):
-        ramp = self.V_low + (self.V_high - self.V_low) * (t / self.T % 1.0)
-        return self.gain * (y.v - self.V_ref) - ramp
-
-    @property
-    def period(self):
-        return self.T
+from nsjax.gallery import BuckConverter as Buck, Charge
 
 
 class Undeclared(Buck):

@@ -559,7 +559,7 @@ def test_spellings(spelling, key):
     "key", ["2.1", "2.1e", "(2.4)", "section 2.3", "example 2.6", "1.1", "1.1(4)", "5.3", "(5.2)", "6.66", "A.1", ""]
 )
 def test_unknown_key(key):
-    with pytest.raises(ValueError, match="Argument `key` must be one of '1.1\\(1\\)'.*'A.9', but got") as error:
+    with pytest.raises(ValueError, match="Argument `key` must be one of '1.1\\(1\\)'.*'neuron', but got") as error:
         gallery.thesis(key)
     assert "\n" not in str(error.value)
 
