@@ -8,7 +8,7 @@ import jax
 import jax.core
 import jax.extend.core as jex
 import jax.numpy as jnp
-from jax.interpreters import ad, partial_eval as pe
+from jax.interpreters import ad
 
 
 Flat = Callable[..., list[Any]]  # of arrays, to arrays
@@ -24,14 +24,71 @@ def opened(closed: jex.ClosedJaxpr) -> jex.ClosedJaxpr:
     return jex.ClosedJaxpr(free, ())
 
 
-def batched_outputs(jaxpr: jex.ClosedJaxpr, batched: Sequence[bool]) -> list[bool]:
+def batched_outputs(closed: jex.ClosedJaxpr, batched: Sequence[bool]) -> list[bool]:
     """Which outputs depend on the inputs that are batched."""
-    outs = jaxpr.jaxpr.outvars
-    found = []
-    for i in range(len(outs)):
-        _, used = pe.dce_jaxpr(jaxpr.jaxpr, [i == j for j in range(len(outs))])
-        found.append(any(u and b for u, b in zip(used, batched)))
-    return found
+    # Forwards, once. (To ask `dce_jaxpr` what each output needs took an eighth of all tracing of derivatives.)
+    jaxpr = closed.jaxpr
+    known = {v for v, b in zip(jaxpr.invars, batched, strict=True) if b}
+
+    def marked(variables: Sequence[Any]) -> list[bool]:
+        return [not isinstance(v, jex.Literal) and v in known for v in variables]
+
+    for eqn in jaxpr.eqns:
+        have = marked(eqn.invars)
+        if any(have):
+            found = REACHED.get(eqn.primitive.name, _all)(have, eqn.params, len(eqn.outvars))
+            known.update(v for v, r in zip(eqn.outvars, found, strict=True) if r)
+    return marked(jaxpr.outvars)
+
+
+def _all(have: list[bool], params: Any, outs: int) -> list[bool]:
+    return [True] * outs
+
+
+def _of_call(have: list[bool], params: Any, outs: int) -> list[bool]:
+    return batched_outputs(params["jaxpr"], have)
+
+
+def _of_cond(have: list[bool], params: Any, outs: int) -> list[bool]:
+    if have[0]:
+        return [True] * outs
+    branches = [batched_outputs(branch, have[1:]) for branch in params["branches"]]
+    return [any(each) for each in zip(*branches)]
+
+
+def _of_while(have: list[bool], params: Any, outs: int) -> list[bool]:
+    first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+    carry = _until_it_stays(params["body_jaxpr"], have[first:second], have[second:], [])[0]
+    stops = batched_outputs(params["cond_jaxpr"], [*have[:first], *carry])
+    return [True] * outs if any(stops) else carry
+
+
+def _of_scan(have: list[bool], params: Any, outs: int) -> list[bool]:
+    first, second = params["num_consts"], params["num_consts"] + params["num_carry"]
+    carry, rest = _until_it_stays(params["jaxpr"], have[:first], have[first:second], have[second:])
+    return [*carry, *rest]
+
+
+def _until_it_stays(
+    body: jex.ClosedJaxpr, consts: list[bool], carry: list[bool], rest: list[bool]
+) -> tuple[list[bool], list[bool]]:
+    """What of the carry of a loop, and of its other results, is reached in the end."""
+    while True:
+        out = batched_outputs(body, [*consts, *carry, *rest])
+        new = [a or b for a, b in zip(carry, out)]
+        if new == carry:
+            return carry, out[len(carry) :]
+        carry = new
+
+
+# Of primitives that have jaxprs: from what reaches their arguments, which results are reached.
+REACHED: dict[str, Callable[[list[bool], Any, int], list[bool]]] = {
+    "jit": _of_call,
+    "pjit": _of_call,
+    "cond": _of_cond,
+    "while": _of_while,
+    "scan": _of_scan,
+}
 
 
 def spread(x: Any, size: int) -> Any:

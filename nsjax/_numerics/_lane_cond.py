@@ -14,7 +14,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 
-from ._inner import batched_outputs, mapped, moving, opened, pushed_forward, spread, with_zeros
+from ._inner import batched_outputs, mapped, moving, opened, pushed_forward, REACHED, spread, with_zeros
 
 
 _GROUP = 32  # lanes worked on together, at least; a kernel costs as much to start as for some hundred lanes
@@ -97,6 +97,11 @@ def _jvp(primals: Any, tangents: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[A
     return out, with_zeros(out, kept, change)
 
 
+def _reached(have: list[bool], params: Any, outs: int) -> list[bool]:
+    inputs, default = _split(have[1:], params["jaxpr"])
+    return [have[0] or a or b for a, b in zip(batched_outputs(params["jaxpr"], inputs), default)]
+
+
 def _shapes(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr) -> list[Any]:
     return list(jaxpr.out_avals)
 
@@ -106,3 +111,4 @@ compact_cond_p.def_abstract_eval(_shapes)
 batching.primitive_batchers[compact_cond_p] = _batch
 ad.primitive_jvps[compact_cond_p] = _jvp
 mlir.register_lowering(compact_cond_p, mlir.lower_fun(_impl, multiple_results=True))
+REACHED["compact_cond"] = _reached

@@ -14,7 +14,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir, partial_eval as pe
 
-from ._inner import batched_outputs, Flat, mapped, moving, opened, pushed_forward, with_zeros
+from ._inner import batched_outputs, Flat, mapped, moving, opened, pushed_forward, REACHED, with_zeros
 
 
 rolled_p = jex.Primitive("rolled")
@@ -111,3 +111,4 @@ batching.primitive_batchers[rolled_p] = _batch
 ad.primitive_jvps[rolled_p] = _jvp
 pe.dce_rules[rolled_p] = _pruned
 mlir.register_lowering(rolled_p, mlir.lower_fun(_impl, multiple_results=True))
+REACHED["rolled"] = lambda have, params, outs: batched_outputs(params["jaxpr"], have)
