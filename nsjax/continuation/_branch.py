@@ -128,7 +128,7 @@ class BranchSegment:
         """With the last point as a special one."""
         return dataclasses.replace(self, special=(*self.special, (len(self.points) - 1, special)))
 
-    def joined(self, other: "BranchSegment", keep: int, known: Any = None) -> "BranchSegment":
+    def join(self, other: "BranchSegment", keep: int, known: Any = None) -> "BranchSegment":
         """The first points of this one, and then the other; `known` is there already, if the other begins with it."""
         before = tuple((i, s) for i, s in self.special if i < keep)
         after = tuple((i + keep, s) for i, s in other.special if i or s is not known)

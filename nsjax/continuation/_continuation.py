@@ -28,9 +28,9 @@ GIVEN = ("model", "path", "like", "integrator", "curve", "tracer", "recorder")  
 class AbstractContinuation(abc.ABC, Generic[P, BranchT]):
     """Iterates over the points of branches as they are found; see `EquilibriumContinuation` and `OrbitContinuation`."""
 
-    parts: ClassVar[tuple[type, type, type]]  # of the curve, of what follows it, and of what explores all branches
-    types: ClassVar[Types]  # of what a file holds
-    joined: ClassVar[Callable[..., Any]]  # two segments that set out from one point, as one branch
+    _parts: ClassVar[tuple[type, type, type]]  # of the curve, of what follows it, and of what explores all branches
+    _types: ClassVar[Types]  # of what a file holds
+    _join: ClassVar[Callable[..., Any]]  # two segments that set out from one point, as one branch
 
     _explorer: AbstractExplorer
     _tree: Tree
@@ -67,7 +67,7 @@ class AbstractContinuation(abc.ABC, Generic[P, BranchT]):
     def branch(self) -> BranchT:
         """What was found so far."""
         curve, name = self._explorer.tracer.curve, self._explorer.name
-        first, *others = (self.joined(curve, name, *pair) for pair in self._tree.branches)
+        first, *others = (self._join(curve, name, *pair) for pair in self._tree.branches)
         return dataclasses.replace(first, others=tuple(others))
 
     def __str__(self) -> str:
@@ -84,7 +84,7 @@ class AbstractContinuation(abc.ABC, Generic[P, BranchT]):
         also after an interrupt."""
         tracer, curve = self._explorer.tracer, self._explorer.tracer.curve
         parts = dict(curve=_given(curve), tracer=_given(tracer), explorer=_given(self._explorer), tree=self._tree)
-        save(path, type(self).__name__, self.types, curve.model.system, curve.like, parts | self._more(), curve=curve)
+        save(path, type(self).__name__, self._types, curve.model.system, curve.like, parts | self._more(), curve=curve)
 
     def _more(self) -> dict[str, Any]:
         """Further parts of a file."""
@@ -93,7 +93,7 @@ class AbstractContinuation(abc.ABC, Generic[P, BranchT]):
     @classmethod
     def _loaded(cls, archive: Archive, progress: bool, for_curve: dict[str, Any], for_explorer: dict[str, Any]) -> Self:
         """From a file, with what that does not hold."""
-        curve_type, tracer_type, explorer_type = cls.parts
+        curve_type, tracer_type, explorer_type = cls._parts
         given, time = archive.part("explorer"), jnp.zeros(())  # of which the model takes the shape only
         curve = curve_type(
             model=SwitchedSystem.forwards(archive.system, time, archive.y),

@@ -42,20 +42,20 @@ class Tree:
         """That which grows."""
         return self.branches[-1][0 if self.back else 1]
 
-    def growing(self, segment: BranchSegment, **changes: Any) -> "Tree":
+    def with_segment(self, segment: BranchSegment, **changes: Any) -> "Tree":
         """With this one in its place."""
         back, ahead = self.branches[-1]
         pair = (segment, ahead) if self.back else (back, segment)
         return dataclasses.replace(self, branches=(*self.branches[:-1], pair), **changes)
 
-    def branching(self, back: BranchSegment, ahead: BranchSegment, **changes: Any) -> "Tree":
+    def with_branch(self, back: BranchSegment, ahead: BranchSegment, **changes: Any) -> "Tree":
         """With another branch, which is to grow."""
         known = dict(start=None, origin=None, back=False, alone=False) | changes
         return dataclasses.replace(self, branches=(*self.branches, (back, ahead)), **known)
 
-    def noting(self, special: Any) -> "Tree":
+    def with_special(self, special: Any) -> "Tree":
         """With the last point as a special one."""
-        return self.growing(self.segment.noting(special))
+        return self.with_segment(self.segment.noting(special))
 
     def half(self, place: Place) -> Any:
         return self.nodes[place[0]].halves[place[1]]
@@ -82,11 +82,11 @@ class AbstractExplorer(abc.ABC):
     borders: ClassVar[tuple[Any, ...]]  # the test functions of the ends of the interval
 
     @abc.abstractmethod
-    def kept(self, tree: Tree, point: Any) -> Any:
+    def segment_point(self, tree: Tree, point: Any) -> Any:
         """What a segment keeps of a point."""
 
     @abc.abstractmethod
-    def passed(self, tree: Tree, zero: Zero, point: Any) -> tuple[Tree, Any]:
+    def pass_by(self, tree: Tree, zero: Zero, point: Any) -> tuple[Tree, Any]:
         """With the special point that was just passed, if it is one; and the last point, as it then is."""
 
     @abc.abstractmethod
@@ -102,7 +102,7 @@ class AbstractExplorer(abc.ABC):
         """On which of its half-branches the trace came to a node."""
 
     @abc.abstractmethod
-    def arrived(self, tree: Tree, zero: Zero, node: Any, number: int | None) -> Tree:
+    def arrive(self, tree: Tree, zero: Zero, node: Any, number: int | None) -> Tree:
         """With what is known of the last point at the node, to which the trace came on the half-branch `number`."""
 
     @abc.abstractmethod
@@ -113,11 +113,11 @@ class AbstractExplorer(abc.ABC):
     def rest(self, tree: Tree) -> Tree:
         """When every half-branch is done: on with what is waiting."""
 
-    def refined(self, tree: Tree, zero: Zero) -> Zero:
+    def exact_zero(self, tree: Tree, zero: Zero) -> Zero:
         """The zero with which the trace ends, as exactly as it can be."""
         return zero
 
-    def unknown(self, tree: Tree, zero: Zero) -> Tree:
+    def no_node(self, tree: Tree, zero: Zero) -> Tree:
         """Where there is no node at the end of the trace."""
         return self.end(tree, self.tracer.lost)
 
@@ -132,8 +132,8 @@ class AbstractExplorer(abc.ABC):
         tree, count = dataclasses.replace(tree, trace=trace), len(tree.trace.points)
         if len(trace.points) > count:
             point = trace.points[-1]
-            tree = tree.growing(tree.segment.then(self.kept(tree, point)))
-        return self.passed(tree, trace.at, point) if trace.passed else (tree, point)
+            tree = tree.with_segment(tree.segment.then(self.segment_point(tree, point)))
+        return self.pass_by(tree, trace.at, point) if trace.passed else (tree, point)
 
     def turn(self, tree: Tree, trace: Trace) -> Tree:
         """What there is at the end of a trace: a way on through a node, or the end of it all."""
@@ -142,24 +142,26 @@ class AbstractExplorer(abc.ABC):
             return self.end(tree, CLOSED if trace.closed else self.reason(tree))
         if zero.test in self.borders:
             return self.end(tree, f"{self.name} = {zero.point.parameter:.6g}")
-        zero = self.refined(tree, zero)
+        zero = self.exact_zero(tree, zero)
         at = next((i for i, n in enumerate(tree.nodes) if n.is_at(zero, tree.tracer.curve)), len(tree.nodes))
         if at == len(tree.nodes):
             node = self.node_at(tree, zero)
             if node is None:
-                return self.unknown(tree, zero)
+                return self.no_node(tree, zero)
             tree = dataclasses.replace(tree, nodes=(*tree.nodes, node))
         node = tree.nodes[at]
+        # A half-branch on which a branch arrived must not be followed a second time, from this side.
         number = self.arrival(tree, node)
         if number is not None:
             tree = dataclasses.replace(tree, used=(*tree.used, (at, number)))
             ahead = tree.partner((at, number))
-        tree = self.arrived(tree, zero, node, number)
+        tree = self.arrive(tree, zero, node, number)
         return self.end(tree, self.label(node.bifurcation)) if ahead is None else self.depart(tree, ahead, trace.begin)
 
     def end(self, tree: Tree, why: str) -> Tree:
-        """The segment is done: on with the next."""
-        tree = tree.growing(dataclasses.replace(tree.segment, end=why))
+        """The segment is done: on with the next. Both ways from one point make one branch: a start has two of them, and
+        a half-branch goes on in its partner."""
+        tree = tree.with_segment(dataclasses.replace(tree.segment, end=why))
         if tree.back or tree.alone:
             return self.go_on(tree)
         if tree.origin is None:
@@ -167,7 +169,7 @@ class AbstractExplorer(abc.ABC):
         partner = tree.partner(tree.origin)
         if partner is None:
             return self.go_on(tree)
-        return self.depart(dataclasses.replace(tree, back=True).growing(BranchSegment()), partner)
+        return self.depart(dataclasses.replace(tree, back=True).with_segment(BranchSegment()), partner)
 
     def go_on(self, tree: Tree) -> Tree:
         """With a branch from the first half-branch that was not yet followed."""
@@ -175,12 +177,12 @@ class AbstractExplorer(abc.ABC):
         if place is None or len(tree.branches) >= self.max_branches:
             return self.rest(tree)
         back = BranchSegment(end=self.label(tree.nodes[place[0]].bifurcation))
-        return self.depart(tree.branching(back, BranchSegment(), origin=place), place)
+        return self.depart(tree.with_branch(back, BranchSegment(), origin=place), place)
 
     def begin(self, tree: Tree, start: Any) -> Tree:
         """A branch from a point that is no node: one way first."""
-        return self.set_out(tree.branching(BranchSegment(end="the start"), BranchSegment(), start=start), start)
+        return self.set_out(tree.with_branch(BranchSegment(end="the start"), BranchSegment(), start=start), start)
 
     def set_out(self, tree: Tree, start: Any, back: bool = False) -> Tree:
         tree = dataclasses.replace(tree, tracer=self.tracer, trace=Trace((start,), begin=start), back=back)
-        return tree.growing(BranchSegment((self.kept(tree, start),)))
+        return tree.with_segment(BranchSegment((self.segment_point(tree, start),)))

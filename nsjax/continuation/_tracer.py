@@ -43,7 +43,7 @@ class Trace(Generic[P]):
     - `before`: how many points of the branch came before these, of those that count for `max_points`.
     - `length`: of the next step.
     - `ahead`: points that the last step found, and that are to come: zeros, and where the step ends.
-    - `at`: the zero that was passed last, if it was after the point before the last one.
+    - `at`: the zero at the last point, or the mark behind it.
     - `end`: the zero with which the trace ends.
     - `why`, `closed`: why there is no other point; whether because it has been all round.
     """
@@ -64,7 +64,7 @@ class Trace(Generic[P]):
 
     @property
     def passed(self) -> bool:
-        """Whether there is a zero at the last point through which the curve goes on."""
+        """Whether the curve goes on through that zero."""
         return self.at is not None and self.at is not self.end
 
 
@@ -101,16 +101,17 @@ class AbstractTracer(abc.ABC, Generic[P]):
     def closes(self, begin: P, before: P, after: P, length: float) -> bool:
         """Whether the curve passes `begin` between two points, in the direction in which it set out there."""
 
-    def noticed(self, point: P, zeros: list[Zero[P]], length: float) -> tuple[Zero[P], ...]:
+    def select(self, point: P, zeros: list[Zero[P]], length: float) -> tuple[Zero[P], ...]:
         """What counts of the zeros in a step from a point, once the step is made."""
         return tuple(zeros)
 
-    def stuck(self, point: P) -> Zero[P] | None:
+    def dead_end(self, point: P) -> Zero[P] | None:
         """What the curve ends at where no step goes on; None if that is not known."""
         return None
 
     def further(self, trace: Trace[P]) -> Trace[P]:
         """The trace with one point more, or a mark passed, or the reason why there is none."""
+        # A step may find several zeros. They come one by one, so that whoever interrupts has every point that is known.
         if not trace.ahead:
             trace = self.next_step(trace)
         if not trace.ahead:
@@ -140,12 +141,14 @@ class AbstractTracer(abc.ABC, Generic[P]):
 
         found = shortened(trace.length, attempt)
         if found is None:
-            end = self.stuck(point)
+            end = self.dead_end(point)
             return dataclasses.replace(trace, ahead=() if end is None else (end,), end=end, why=self.lost)
         length, (after, turn, between) = found
-        zeros = self.noticed(point, between, length)
+        # Only now: an attempt that was too long may have found zeros too, and to describe them is expensive.
+        zeros = self.select(point, between, length)
         if zeros and not self.passes(zeros[-1]):
             return dataclasses.replace(trace, ahead=zeros, end=zeros[-1])
+        # The first steps are beside the beginning anyway.
         if trace.begin is not None and count > 3 and self.closes(trace.begin, point, after, length):
             return dataclasses.replace(trace, ahead=(*zeros, trace.begin), closed=True)
         tangent, u = np.asarray(after.tangent), np.asarray(after.u)

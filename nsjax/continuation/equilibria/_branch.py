@@ -62,7 +62,7 @@ def branch_of(curve: EquilibriumCurve, parameter: str, back: BranchSegment, ahea
     corner = bool(back.special) and back.special[-1][0] == keep - 1 and back.special[-1][1].discontinuous
     keep = max(keep - (0 if corner else 1), 0)
     last = next((b for i, b in back.special[::-1] if corner and i < keep), None)
-    segment = back.joined(ahead, keep, last)
+    segment = back.join(ahead, keep, last)
     if descends([point.parameter for point in segment.points]):
         segment, ends = segment.reversed(), ends[::-1]
     records = [point.record for point in segment.points]

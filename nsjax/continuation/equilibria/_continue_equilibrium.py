@@ -51,9 +51,9 @@ class EquilibriumContinuation(AbstractContinuation[EquilibriumPoint, Branch]):
     `continue_equilibrium`.
     """
 
-    parts = EquilibriumCurve, EquilibriumTracer, EquilibriumExplorer
-    types = growth_types(Branch, EquilibriumTracer, EquilibriumPoint, Record, Step, Probe, Node, Departure)
-    joined = staticmethod(branch_of)
+    _parts = EquilibriumCurve, EquilibriumTracer, EquilibriumExplorer
+    _types = growth_types(Branch, EquilibriumTracer, EquilibriumPoint, Record, Step, Probe, Node, Departure)
+    _join = staticmethod(branch_of)
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ class EquilibriumContinuation(AbstractContinuation[EquilibriumPoint, Branch]):
 
         **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model.
         """
-        archive = Archive(path, "EquilibriumContinuation", cls.types, system, y)
+        archive = Archive(path, "EquilibriumContinuation", cls._types, system, y)
         return cls._loaded(archive, progress, {}, {})
 
 

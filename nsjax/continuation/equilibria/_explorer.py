@@ -28,13 +28,13 @@ class EquilibriumExplorer(AbstractExplorer):
 
     borders = (LOW, HIGH)
 
-    def kept(self, tree: Tree, point: EquilibriumPoint) -> EquilibriumPoint:
+    def segment_point(self, tree: Tree, point: EquilibriumPoint) -> EquilibriumPoint:
         return point._replace(step=None)
 
-    def passed(self, tree: Tree, zero: Zero, point: Any) -> tuple[Tree, Any]:
-        return self.beyond_start(tree, zero.point.u) if zero.test == MARK else tree.noting(zero.special), point
+    def pass_by(self, tree: Tree, zero: Zero, point: Any) -> tuple[Tree, Any]:
+        return self.without_start(tree, zero.point.u) if zero.test == MARK else tree.with_special(zero.special), point
 
-    def beyond_start(self, tree: Tree, u: Any) -> Tree:
+    def without_start(self, tree: Tree, u: Any) -> Tree:
         """Without the starts that are the same equilibrium."""
         x = self.tracer.curve.parts(u)[0]
         sizes = self.tracer.curve.units[: len(x)]
@@ -55,10 +55,10 @@ class EquilibriumExplorer(AbstractExplorer):
         half = matching(node.halves, end.mode, -end.tangent)
         return None if half is None else node.halves.index(half)
 
-    def arrived(self, tree: Tree, zero: Any, node: Node, number: int | None) -> Tree:
+    def arrive(self, tree: Tree, zero: Any, node: Node, number: int | None) -> Tree:
         """Unless it is a point like any other, as where the branch runs along a surface."""
         plain = node.bifurcation.kind == "none" and not node.bifurcation.discontinuous
-        return tree if plain else tree.noting(node.bifurcation)
+        return tree if plain else tree.with_special(node.bifurcation)
 
     def depart(self, tree: Tree, place: Place, begin: Any = None) -> Tree:
         node, half, segment = tree.nodes[place[0]], tree.half(place), tree.segment
@@ -68,12 +68,13 @@ class EquilibriumExplorer(AbstractExplorer):
             if not half.regular:  # an eigenvalue is zero there, whose sign would be that of rounding
                 record = record._replace(eigenvalues=half.step.record.eigenvalues, stable=half.step.record.stable)
             segment = segment.then(EquilibriumPoint(half.u, half.tangent, half.mode, record))
-        # Where the equations are singular, a branch is entered by its first step.
+        # Where the equations are singular, a branch is entered by its first step. (That is no point of the branch; what
+        # is known of the node counts as the point before, for what a step might hide.)
         u, tangent = (half.u, half.tangent) if half.regular else (half.step.u, half.step.tangent)
         start = EquilibriumPoint(u, tangent, half.mode, segment.points[-1].record)
         trace = Trace((start,), begin=begin, before=len(segment.points) - 1)
-        tree = tree.growing(segment, tracer=self.tracer, trace=trace, used=(*tree.used, place))
-        return self.arrived(tree, None, node, None) if first else tree
+        tree = tree.with_segment(segment, tracer=self.tracer, trace=trace, used=(*tree.used, place))
+        return self.arrive(tree, None, node, None) if first else tree
 
     def rest(self, tree: Tree) -> Tree:
         """From the next start."""
@@ -82,9 +83,9 @@ class EquilibriumExplorer(AbstractExplorer):
                 raise ValueError(ALONE)
             return dataclasses.replace(tree, trace=None)
         curve, (u, mode) = self.tracer.curve, tree.waiting[0]
-        tree = self.beyond_start(dataclasses.replace(tree, waiting=tree.waiting[1:]), u)
+        tree = self.without_start(dataclasses.replace(tree, waiting=tree.waiting[1:]), u)
         tangents, regular = directions(curve, u, mode)
-        # Upwards first.
+        # Upwards first. (At a node tangents may be missing, and are not needed.)
         tangent = jnp.asarray(max(tangents, key=lambda d: d[-1], default=jnp.zeros_like(u)))
         point = EquilibriumPoint(u, tangent, mode, kept(curve, u, jnp.asarray(mode)))
         if np.any(active(curve, u, mode)) or not regular:
@@ -95,4 +96,4 @@ class EquilibriumExplorer(AbstractExplorer):
             raise ValueError(ALONE)
         special = start_at(curve, self.name, u, mode, tangent)
         tree = self.begin(tree, point)
-        return tree if special is None else tree.noting(special)
+        return tree if special is None else tree.with_special(special)

@@ -52,7 +52,7 @@ class EquilibriumTracer(AbstractTracer[EquilibriumPoint]):
         there = near & (tangent @ (u - start) < 0) & (tangent @ (end - start) >= 0)
         return np.array_equal(after.mode, begin.mode) and bool(there)
 
-    def noticed(self, point: EquilibriumPoint, zeros: list[Zero], length: float) -> tuple[Zero, ...]:
+    def select(self, point: EquilibriumPoint, zeros: list[Zero], length: float) -> tuple[Zero, ...]:
         """With what bifurcates at those that are passed; without those where nothing does."""
         found, last = [], point
         for zero in zeros:
@@ -62,10 +62,10 @@ class EquilibriumTracer(AbstractTracer[EquilibriumPoint]):
                 special = described(self.curve, self.name, here.u, here.mode, here.tangent, length / 10)
                 if special is None:
                     continue
-                zero = zero._replace(point=self.recorded(here.u, here), special=special)
+                zero = zero._replace(point=self.point_at(here.u, here), special=special)
                 last = zero.point
             elif zero.test != MARK:
-                end = self.branch_point(here, point, last) if zero.test == BRANCH else self.recorded(here.u, here)
+                end = self.branch_point(here, point, last) if zero.test == BRANCH else self.point_at(here.u, here)
                 zero = zero._replace(point=end, marks=zero.s == 0)
                 if zero.test in (LOW, HIGH) and abs(float(end.u[-1] - self.curve.mark)) < 1e-9:
                     found.append(Zero(zero.s, MARK, end, marks=True))
@@ -77,20 +77,20 @@ class EquilibriumTracer(AbstractTracer[EquilibriumPoint]):
     ) -> EquilibriumPoint:
         """Improved; an eigenvalue is zero there, whose sign would be that of rounding."""
         u, good = branch_point(self.curve, here.u, jnp.asarray(here.mode))
-        found = self.recorded(u if good and float(jnp.max(jnp.abs(u - here.u))) < 1e-5 else here.u, here)
+        found = self.point_at(u if good and float(jnp.max(jnp.abs(u - here.u))) < 1e-5 else here.u, here)
         record = found.record._replace(eigenvalues=last.record.eigenvalues, stable=last.record.stable)
         return found._replace(tangent=before.tangent, record=record)
 
-    def recorded(self, u: Any, like: EquilibriumPoint) -> EquilibriumPoint:
+    def point_at(self, u: Any, like: EquilibriumPoint) -> EquilibriumPoint:
         return like._replace(u=u, record=kept(self.curve, u, jnp.asarray(like.mode)))
 
-    def stuck(self, point: EquilibriumPoint) -> Zero | None:
+    def dead_end(self, point: EquilibriumPoint) -> Zero | None:
         """Where there is no way past a surface with this side's equations, one ends on it."""
         on = np.flatnonzero(active(self.curve, point.u, point.mode))
         if not len(on):
             return None
         u = on_surface(self.curve, point.u, jnp.asarray(point.mode), jnp.asarray(on[0]))
-        return Zero(0.0, GUARDS + int(on[0]), self.recorded(u, point))
+        return Zero(0.0, GUARDS + int(on[0]), self.point_at(u, point))
 
     def changed(self, before: Record, after: Record) -> bool:
         """Whether the number of unstable eigenvalues differs beyond doubt."""

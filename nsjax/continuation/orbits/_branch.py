@@ -155,7 +155,7 @@ def orbit_branch(curve: OrbitCurve, parameter: str, back: BranchSegment, ahead: 
     common = bool(first.special and ahead.special) and first.special[-1][1] is ahead.special[0][1]
     if keep and ahead.points and not common:
         keep -= first.points[-1].spot.look.u is ahead.points[0].spot.look.u
-    piece = first.joined(ahead, keep, first.special[-1][1] if common else None)
+    piece = first.join(ahead, keep, first.special[-1][1] if common else None)
     if piece.points[0].admissible and descends([point.parameter for point in piece.points]):
         piece, ends = _reversed(piece), ends[::-1]
     spots = [point.spot for point in piece.points]

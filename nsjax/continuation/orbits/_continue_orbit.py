@@ -48,8 +48,8 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
     `continue_orbit`.
     """
 
-    parts = OrbitCurve, OrbitTracer, OrbitExplorer
-    types = growth_types(
+    _parts = OrbitCurve, OrbitTracer, OrbitExplorer
+    _types = growth_types(
         OrbitBranch,
         OrbitTracer,
         Origin,
@@ -63,7 +63,7 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         Cycle,
         Point,
     )
-    joined = staticmethod(orbit_branch)
+    _join = staticmethod(orbit_branch)
 
     _explorer: OrbitExplorer
 
@@ -129,7 +129,7 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model or solver
         or with other records.
         """
-        archive = Archive(path, "OrbitContinuation", cls.types, system, y)
+        archive = Archive(path, "OrbitContinuation", cls._types, system, y)
         integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
         if plain(repr(integrator)) != archive.part("integrator"):
             raise ValueError(

@@ -43,14 +43,14 @@ class OrbitExplorer(AbstractExplorer):
 
     borders = (Test("low"), Test("high"))
 
-    def kept(self, tree: Tree, spot: OrbitPoint) -> Point:
+    def segment_point(self, tree: Tree, spot: OrbitPoint) -> Point:
         curve = tree.tracer.curve
         return self.point(spot, curve, not tree.alone or admissible(curve, spot))
 
     def point(self, spot: OrbitPoint, curve: OrbitCurve, admissible: bool = True) -> Point:
         return Point(spot, int(curve.order), self.recorder(curve, spot), admissible)
 
-    def passed(self, tree: Tree, zero: Zero, point: Any) -> tuple[Tree, Any]:
+    def pass_by(self, tree: Tree, zero: Zero, point: Any) -> tuple[Tree, Any]:
         tracer, trace, side = tree.tracer, tree.trace, 0
         if zero.test.kind == "flip":
             node = next((n for n in tree.nodes if n.is_at(zero, tracer.curve)), None)
@@ -58,16 +58,16 @@ class OrbitExplorer(AbstractExplorer):
                 node = node_at(tracer, self.name, zero, 2)
                 if node is not None and 2 * int(tracer.curve.order) <= self.max_order:
                     tree = dataclasses.replace(tree, nodes=(*tree.nodes, node))
-            return tree if node is None else tree.noting(node.bifurcation), point
+            return tree if node is None else tree.with_special(node.bifurcation), point
         if zero.test.kind == "fold":
             hopf = hopf_end(self.name, tracer.curve, trace)
             if hopf is not None:
                 last, made = hopf
-                tree = tree.growing(tree.segment.ending(self.point(last, tracer.curve)).noting(made))
+                tree = tree.with_segment(tree.segment.ending(self.point(last, tracer.curve)).noting(made))
                 return self.end(tree, self.label(made)), last
             side = 1 if trace.points[-2].parameter > zero.point.parameter else -1
         made = OrbitBifurcation.smooth(zero.test.kind, self.name, zero.point, tracer.curve, [], side)
-        return tree.noting(made), point
+        return tree.with_special(made), point
 
     def reason(self, tree: Tree) -> str:
         last, curve = tree.trace.points[-1], tree.tracer.curve
@@ -75,25 +75,25 @@ class OrbitExplorer(AbstractExplorer):
         beside = ", beside a continuum of orbits that friction holds" if held else ""
         return f"{tree.trace.why}, at {last.parameter:.10g}{beside}"
 
-    def refined(self, tree: Tree, zero: Zero) -> Zero:
+    def exact_zero(self, tree: Tree, zero: Zero) -> Zero:
         return limits(tree.tracer, tree.trace, exactly(tree.tracer, zero) or zero)
 
     def node_at(self, tree: Tree, zero: Zero) -> Node | None:
         return node_at(tree.tracer, self.name, zero, max(1, self.max_order // int(tree.tracer.curve.order)))
 
-    def unknown(self, tree: Tree, zero: Zero) -> Tree:
+    def no_node(self, tree: Tree, zero: Zero) -> Tree:
         curve, why = tree.tracer.curve, f"{zero.test.kind} at {self.name} = {zero.point.parameter:.10g}"
-        tree = tree.growing(tree.segment.ending(self.point(zero.point, curve)))
+        tree = tree.with_segment(tree.segment.ending(self.point(zero.point, curve)))
         return self.end(self.leave(tree, Exit(why, curve, zero.point, outwards(tree.trace))), why)
 
-    def arrived(self, tree: Tree, zero: Zero, node: Node, number: int | None) -> Tree:
+    def arrive(self, tree: Tree, zero: Zero, node: Node, number: int | None) -> Tree:
         curve, segment, made = tree.tracer.curve, tree.segment, node.bifurcation
         last = dataclasses.replace(zero.point, stable=segment.points[-2].spot.stable)
         if made.discontinuous:
             tree = self.leave(tree, Exit(self.label(made), curve, zero.point, outwards(tree.trace)))
             if number is not None:
                 last = dataclasses.replace(last, multipliers=node.halves[number].multipliers)
-        return tree.growing(segment.ending(self.point(last, curve)).noting(made))
+        return tree.with_segment(segment.ending(self.point(last, curve)).noting(made))
 
     def depart(self, tree: Tree, place: Place, begin: Any = None) -> Tree:
         """With the multipliers that the half-branch has at the point."""
@@ -109,7 +109,7 @@ class OrbitExplorer(AbstractExplorer):
         if made.discontinuous and self.virtual:
             behind = self.behind(node, half)
             tree = tree if behind is None else self.leave(tree, Exit(self.label(made), half.curve, node.spot, behind))
-        return tree.growing(segment, tracer=tracer, trace=trace, used=(*tree.used, place))
+        return tree.with_segment(segment, tracer=tracer, trace=trace, used=(*tree.used, place))
 
     def leave(self, tree: Tree, exit: Exit) -> Tree:
         """A itinerary, at a corner: if virtual orbits are asked for."""
@@ -133,7 +133,7 @@ class OrbitExplorer(AbstractExplorer):
         exit, *others = tree.waiting
         tracer, trace = dataclasses.replace(self.tracer, curve=exit.curve, virtual=True), Trace((exit.spot,))
         back, ahead = BranchSegment(end=exit.name), BranchSegment((self.point(exit.corner, exit.curve, False),))
-        return tree.branching(back, ahead, tracer=tracer, trace=trace, alone=True, waiting=tuple(others))
+        return tree.with_branch(back, ahead, tracer=tracer, trace=trace, alone=True, waiting=tuple(others))
 
     def arrival(self, tree: Tree, node: Node) -> int | None:
         """That which has the same orbit at the same parameter."""

@@ -108,7 +108,7 @@ class OrbitTracer(AbstractTracer[OrbitPoint]):
     def passes(self, zero: Zero) -> bool:
         return zero.test.kind in PASSED
 
-    def noticed(self, point: OrbitPoint, zeros: list[Zero], length: float) -> tuple[Zero, ...]:
+    def select(self, point: OrbitPoint, zeros: list[Zero], length: float) -> tuple[Zero, ...]:
         return tuple(
             zero for zero in zeros if zero.test.kind != "Neimark-Sacker" or complex_pair(zero.point.multipliers)
         )
