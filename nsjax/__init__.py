@@ -28,6 +28,7 @@ from .continuation import (
     continue_equilibrium as continue_equilibrium,
     continue_orbit as continue_orbit,
     continue_orbits as continue_orbits,
+    EquilibriumContinuation as EquilibriumContinuation,
     OrbitBranch as OrbitBranch,
     OrbitContinuation as OrbitContinuation,
 )

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from .. import plot
-from ..continuation.equilibria._branch import CLOSED
+from ..continuation._branch import CLOSED
 from ..continuation.orbits._bifurcation import OrbitBifurcation
 from ..continuation.orbits._branch import OrbitBranch
 from ..plot._diagram import UNSTABLE, write_names

@@ -7,7 +7,10 @@ from .bifurcations._continue_bifurcation import (
 )
 from .equilibria._bifurcation import Bifurcation as Bifurcation, HalfBranch as HalfBranch
 from .equilibria._branch import Branch as Branch
-from .equilibria._continue_equilibrium import continue_equilibrium as continue_equilibrium
+from .equilibria._continue_equilibrium import (
+    continue_equilibrium as continue_equilibrium,
+    EquilibriumContinuation as EquilibriumContinuation,
+)
 from .equilibria._hopf_orbits import hopf_orbits as hopf_orbits
 from .orbits._bifurcation import OrbitBifurcation as OrbitBifurcation, OrbitHalfBranch as OrbitHalfBranch
 from .orbits._branch import OrbitBranch as OrbitBranch

@@ -1,6 +1,7 @@
 """What branches have in common, be they of equilibria or of periodic orbits."""
 
 import abc
+import dataclasses
 import os
 from collections.abc import Sequence
 from typing import Any, ClassVar, Generic, Self, TypeVar
@@ -17,6 +18,7 @@ from ._special_point import AbstractSpecialPoint
 
 
 SpecialT = TypeVar("SpecialT", bound=AbstractSpecialPoint)
+CLOSED = "the start: it is closed"  # why a branch ends
 
 
 class AbstractBranch(eqx.Module, Generic[SpecialT]):
@@ -105,6 +107,36 @@ class AbstractBranch(eqx.Module, Generic[SpecialT]):
         words = self._words()
         runs = [word for i, word in enumerate(words) if i == 0 or words[i - 1] != word]
         return ", then ".join(runs) if len(runs) <= 6 else f"{len(runs) - 1} changes of stability"
+
+
+@dataclasses.dataclass(frozen=True)
+class BranchSegment:
+    """Points one after the other, and the special ones among them, while they are found."""
+
+    points: tuple[Any, ...] = ()
+    special: tuple[tuple[int, Any], ...] = ()
+    end: str = "here, so far"
+
+    def then(self, point: Any) -> "BranchSegment":
+        return dataclasses.replace(self, points=(*self.points, point))
+
+    def ending(self, point: Any) -> "BranchSegment":
+        """With another last point."""
+        return dataclasses.replace(self, points=(*self.points[:-1], point))
+
+    def noting(self, special: Any) -> "BranchSegment":
+        """With the last point as a special one."""
+        return dataclasses.replace(self, special=(*self.special, (len(self.points) - 1, special)))
+
+    def join(self, other: "BranchSegment", keep: int, known: Any = None) -> "BranchSegment":
+        """The first points of this one, and then the other; `known` is there already, if the other begins with it."""
+        before = tuple((i, s) for i, s in self.special if i < keep)
+        after = tuple((i + keep, s) for i, s in other.special if i or s is not known)
+        return BranchSegment(self.points[:keep] + other.points, before + after)
+
+    def reversed(self) -> "BranchSegment":
+        last = len(self.points) - 1
+        return BranchSegment(self.points[::-1], tuple((last - i, s) for i, s in self.special[::-1]), self.end)
 
 
 def descends(values: Sequence[Any]) -> bool:

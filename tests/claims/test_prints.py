@@ -178,11 +178,12 @@ def test_without_numbers(name):
 
 
 def test_all_public_results_are_in_the_table():
-    """`Solution` is in `test_mistakes`, `OrbitContinuation` in `test_orbit_growth`."""
+    """`Solution` is in `test_mistakes`, continuations are in `test_orbit_growth` and `test_equilibrium_growth`."""
     others = {
         "Method",
         "Segment",
         "Solution",
+        "EquilibriumContinuation",
         "OrbitContinuation",
         "System",
         "Exponential",

@@ -1,6 +1,5 @@
 """Continuations while they grow: interrupted, saved, loaded, gone on with; measured and watched."""
 
-import dataclasses
 import json
 from functools import partial
 from typing import NamedTuple
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from branches import same
 from models import Motion, pid
 
 import nsjax
@@ -85,23 +85,6 @@ def duffing():
     orbit = find_orbit(system, {"x": jnp.asarray(1.5), "v": jnp.asarray(0.0)}, **METHOD)
     what, options = (system, orbit, "omega", (0.91, 1.02)), dict(max_step=0.1, max_laps=1, record=MEASURES)
     return what, options, *grown(*what, **options)
-
-
-def same(found, want):
-    """Number for number, and the same special points in both."""
-    assert type(found) is type(want) and len(found.branches) == len(want.branches)
-    named = {}
-    for one, other in zip(found.branches, want.branches):
-        fields = {field.name for field in dataclasses.fields(other)} - {"system", "special", "others"}
-        assert jax.tree.structure(one.ys) == jax.tree.structure(other.ys)
-        for name in fields:
-            jax.tree.map(np.testing.assert_array_equal, getattr(one, name), getattr(other, name))
-        assert len(one.special) == len(other.special)
-        for a, b in zip(one.special, other.special):
-            assert named.setdefault(id(b), a) is a
-            assert str(a) == str(b)
-    assert str(found) == str(want)
-    assert eqx.tree_equal(found.system, want.system)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.55, 0.8, 1.0])

@@ -4,6 +4,7 @@ branches made by hand."""
 import dataclasses
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,3 +104,20 @@ def branch_of(system, parameter, values, heights, multipliers, special=(), indic
         indices=tuple(indices), ends=("", ""), others=tuple(others), admissible=np.ones(n, bool),
         segments=((),) * n, records={"top": heights, "rows": np.zeros((n, 2))},
     )  # fmt: skip
+
+
+def same(found, want):
+    """Number for number, and the same special points in both."""
+    assert type(found) is type(want) and len(found.branches) == len(want.branches)
+    named = {}
+    for one, other in zip(found.branches, want.branches):
+        fields = {field.name for field in dataclasses.fields(other)} - {"system", "special", "others"}
+        assert jax.tree.structure(one.ys) == jax.tree.structure(other.ys)
+        for name in fields:
+            jax.tree.map(np.testing.assert_array_equal, getattr(one, name), getattr(other, name))
+        assert len(one.special) == len(other.special)
+        for a, b in zip(one.special, other.special):
+            assert named.setdefault(id(b), a) is a
+            assert str(a) == str(b)
+    assert str(found) == str(want)
+    assert eqx.tree_equal(found.system, want.system)

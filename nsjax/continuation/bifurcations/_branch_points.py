@@ -17,8 +17,8 @@ from jaxtyping import Array
 from ..._numerics._compile import interactive
 from ...orbits.segments._equations import OrbitCurve, row_sizes
 from ...orbits.segments._itinerary import OrbitItinerary
-from ..orbits._test_functions import Test
-from ..orbits._tracer import of_circle, of_corners, OrbitPoint
+from ..orbits._test_functions import of_circle, of_corners, Test
+from ..orbits._tracer import OrbitPoint
 from ._surface import AbstractBifurcationTracer, DELTA, interval_tests, Place, seen_at
 
 
@@ -122,7 +122,7 @@ class BranchLocus(AbstractBifurcationTracer):
 
     def step(self, place: Place, length: float) -> OrbitPoint:
         frame = _Frame.at(self.curve, place.spot.itinerary, place.spot.look.u)
-        ahead = frame.plane @ place.along
+        ahead = frame.plane @ place.tangent
         return self._seen(place.spot.itinerary, frame.critical(ahead / np.linalg.norm(ahead), length), frame)
 
     def _seen(self, itinerary: OrbitItinerary, u: np.ndarray, frame: _Frame) -> OrbitPoint:

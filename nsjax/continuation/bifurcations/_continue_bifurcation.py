@@ -12,7 +12,9 @@ from ..._types import Y
 from ...orbits.segments._equations import OrbitCurve
 from ...system._parameter import get_parameter, parameter_path
 from ...system._system import System
-from ..equilibria._branch import CLOSED
+from .._branch import CLOSED
+from .._checks import check_interval
+from .._tracer import Trace, Zero
 from ..orbits._bifurcation import OrbitBifurcation, Origin
 from ..orbits._record import states_of
 from ..orbits._test_functions import CORNERS, Test
@@ -20,7 +22,7 @@ from ..orbits._tracer import midpoint, OrbitPoint
 from ..orbits.corners._corner import is_impact
 from ._branch_points import BranchLocus
 from ._surface import BifurcationTracer, CUSP, lift, Place, RESONANCES, surfaces_of, touches
-from ._tracer import Codim2Point, FAILED, LAST, Trace, trace
+from ._tracer import CurveTracer, FAILED, LAST
 
 
 @shown
@@ -151,15 +153,16 @@ def continue_bifurcation(
     origin, path, low, high = _checked(special, parameter, interval, first)
     surface, spot, test = lift(origin, path, low, high)
     locus, place = _locus(special, parameter, surface, spot, test)
-    ahead = trace(locus, place, max_step, max_points)
-    back = Trace([place.spot]) if ahead.closed else trace(locus, place.turned, max_step, max_points)
+    tracer = CurveTracer(locus, max_step, max_points)
+    ahead, later = tracer.trace(place)
+    back, earlier = (Trace((place,)), []) if ahead.closed else tracer.trace(place.turned)
     names = (special.parameter, parameter)
     kind, surfaces = _kind(surface, spot, special, test)
-    spots = back.spots[:0:-1] + ahead.spots
-    shift = len(back.spots) - 1
-    met = [(shift - i, m) for i, m in back.met[::-1]] + [(shift + i, m) for i, m in ahead.met]
+    spots = [place.spot for place in back.points[:0:-1] + ahead.points]
+    shift = len(back.points) - 1
+    met = [(shift - i, zero) for i, zero in earlier[::-1]] + [(shift + i, zero) for i, zero in later]
     ends = [CLOSED if ahead.closed else _end(surface, t, names) for t in (back, ahead)]
-    known = [(i, m) for i, m in met if m.test.kind not in ("low", "high")]
+    known = [(i, zero) for i, zero in met if zero.test.kind not in ("low", "high")]
     bases = [midpoint(surface, s, s.itinerary.rows) for s in spots]
     unravel = jfu.ravel_pytree(surface.like)[1]
     silent = {test.kind for test in locus.silent}
@@ -168,13 +171,13 @@ def continue_bifurcation(
         rho = np.asarray(spot.multipliers, complex)
         return np.full_like(rho, np.nan) if "flip" in silent else rho
 
-    def codimension_two(i: int, m: Codim2Point) -> CodimensionTwo:
-        t, x, _ = bases[i]
+    def codimension_two(i: int, zero: Zero[Place]) -> CodimensionTwo:
+        (t, x, _), spot = bases[i], zero.point.spot
         return CodimensionTwo(
-            name=_name(surface, kind, m),
-            values=np.array(m.spot.look.parameter),
-            period=float(m.spot.look.period),
-            multipliers=multipliers(m.spot),
+            name=_name(surface, kind, zero.test, spot),
+            values=np.array(spot.look.parameter),
+            period=float(spot.look.period),
+            multipliers=multipliers(spot),
             t=t,
             y=unravel(x),
         )
@@ -189,7 +192,7 @@ def continue_bifurcation(
         multipliers=np.stack([multipliers(s) for s in spots]),
         ts=np.array([t for t, _, _ in bases]),
         ys=states_of(surface.like, np.stack([x for _, x, _ in bases])),
-        special=tuple(codimension_two(i, m) for i, m in known),
+        special=tuple(codimension_two(i, zero) for i, zero in known),
         indices=tuple(i for i, _ in known),
         ends=(ends[0], ends[1]),
     )
@@ -222,15 +225,8 @@ def _checked(
         raise ValueError(f"Argument `parameter` must be another one than that of the branch, `{parameter}`.")
     if first is None:
         first = float(curve.low), float(curve.low + curve.width)
-    for name, one, value in (
-        ("interval", interval, float(get_parameter(system, path))),
-        ("first", first, special.value),
-    ):
-        if not one[0] < one[1] or not one[0] <= value <= one[1]:
-            raise ValueError(
-                f"Argument `{name}` must be (low, high) and hold {value:.6g}, the value at the special point, but is "
-                f"({one[0]:.6g}, {one[1]:.6g})."
-            )
+    check_interval("interval", interval, float(get_parameter(system, path)), "at the special point")
+    check_interval("first", first, special.value, "at the special point")
     low, high = (np.array([first[i], interval[i]], float) for i in (0, 1))
     return origin, path, low, high
 
@@ -243,8 +239,8 @@ def _locus(
     locus = kind_of_locus(surface, test, float(spot.look.branch[1]))
     try:
         place = locus.place(spot)
-        place = locus.place(locus.step(place, 0.0), place.along, place.heading)
-        near = [locus.place(locus.step(place, s), place.along, place.heading) for s in (1e-3, -1e-3)]
+        place = locus.place(locus.step(place, 0.0), place.tangent, place.heading)
+        near = [locus.place(locus.step(place, s), place.tangent, place.heading) for s in (1e-3, -1e-3)]
     except FAILED as why:
         raise ValueError(
             f"Argument `special` must lie on a curve of such points in {special.parameter} and {parameter}, but beside "
@@ -268,33 +264,32 @@ def _touching(curve: OrbitCurve, spot: OrbitPoint, test: Test) -> str:
     return "grazing" if test.kind in ("guard", "grazing") else "corner"
 
 
-def _name(curve: OrbitCurve, kind: str, met: Codim2Point) -> str:
-    test = met.test
+def _name(curve: OrbitCurve, kind: str, test: Test, spot: OrbitPoint) -> str:
     if test.kind in (*CORNERS, "grazing"):
-        touched = ", ".join(surfaces_of(curve, met.spot, test))
+        touched = ", ".join(surfaces_of(curve, spot, test))
         if kind in ("grazing", "tangency", "corner"):
-            other = _touching(curve, met.spot, test)
+            other = _touching(curve, spot, test)
             return f"double {kind}" if other == kind else f"{kind} and {other} of {touched}"
-        return f"{kind} at a {_touching(curve, met.spot, test)} of {touched}"
+        return f"{kind} at a {_touching(curve, spot, test)} of {touched}"
     if test == CUSP or test in RESONANCES:
         return test.kind
     both = {kind, test.kind}
     if both == {"fold", "flip"}:
         return "fold-flip"
     if test.kind == "Neimark-Sacker" and kind in ("fold", "flip"):
-        pair = np.any(np.abs(np.imag(met.spot.multipliers)) > 1e-3)
+        pair = np.any(np.abs(np.imag(spot.multipliers)) > 1e-3)
         return f"{kind}-Neimark-Sacker" if pair else {"fold": "1:1 resonance", "flip": "1:2 resonance"}[kind]
     other = {"branch": "branch point"}.get(test.kind, test.kind)
     return f"{kind}-{other}"
 
 
-def _end(curve: OrbitCurve, traced: Trace, names: tuple[str, str]) -> str:
-    met = traced.end
-    if met is None:
-        at = ", ".join(f"{n} = {v:.6g}" for n, v in zip(names, traced.spots[-1].look.parameter))
+def _end(curve: OrbitCurve, traced: Trace[Place], names: tuple[str, str]) -> str:
+    end, spot = traced.end, traced.points[-1].spot
+    if end is None:
+        at = ", ".join(f"{n} = {v:.6g}" for n, v in zip(names, spot.look.parameter))
         return f"{traced.why}, at {at}"
-    if met.test.kind in ("low", "high"):
-        return f"{names[met.test.row]} = {met.spot.look.parameter[met.test.row]:.6g}"
-    if met.test.kind in LAST[:5]:
-        return f"a {_touching(curve, met.spot, met.test)} of {', '.join(surfaces_of(curve, met.spot, met.test))}"
-    return met.test.kind
+    if end.test.kind in ("low", "high"):
+        return f"{names[end.test.row]} = {spot.look.parameter[end.test.row]:.6g}"
+    if end.test.kind in LAST[:5]:
+        return f"a {_touching(curve, spot, end.test)} of {', '.join(surfaces_of(curve, spot, end.test))}"
+    return end.test.kind

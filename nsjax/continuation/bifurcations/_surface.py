@@ -19,8 +19,8 @@ from ...orbits.segments._itinerary import capacity_for, EVENT, GRAZING, OrbitIti
 from ...orbits.segments._point import correct, PointData
 from ...system._parameter import get_parameter
 from ..orbits._bifurcation import Origin
-from ..orbits._test_functions import branch_value, CIRCLE, CORNERS, Test
-from ..orbits._tracer import of_circle, of_corners, OrbitPoint, spot_of
+from ..orbits._test_functions import branch_value, CIRCLE, CORNERS, of_circle, of_corners, Test
+from ..orbits._tracer import OrbitPoint, spot_of
 
 
 DELTA = 1e-4  # of the differences that give the gradient of a test function, in units of the surface
@@ -35,20 +35,24 @@ RESONANCES = {Test("1:1 resonance"): -1.0, Test("1:2 resonance"): 1.0, Test("1:3
 class Place:
     """A point of a curve on the surface.
 
-    `along`: its unit tangent there. `across`, `slope`: the direction across it on the surface, and the derivative of
+    `tangent`: of length one. `across`, `slope`: the direction across it on the surface, and the derivative of
     the test function in it. `heading`: the direction in which the projection of the surface on the plane of the
     parameters is not singular, the same way along the whole curve.
     """
 
     spot: OrbitPoint
-    along: np.ndarray
+    tangent: np.ndarray
     across: np.ndarray
     slope: float
     heading: np.ndarray
 
     @property
+    def u(self) -> Any:
+        return self.spot.look.u
+
+    @property
     def turned(self) -> "Place":
-        return dataclasses.replace(self, along=-self.along)
+        return dataclasses.replace(self, tangent=-self.tangent)
 
 
 def lift(
@@ -174,7 +178,7 @@ class BifurcationTracer(AbstractBifurcationTracer):
     def step(self, place: Place, length: float) -> OrbitPoint:
         """By the secant method across the tangent."""
         frame = place.spot.look.tangent
-        ahead, across = frame @ place.along, frame @ place.across
+        ahead, across = frame @ place.tangent, frame @ place.across
         c, slope = 0.0, place.slope
         spot = self.at(place.spot, length * ahead)
         value = self.value(spot)
@@ -201,7 +205,7 @@ class BifurcationTracer(AbstractBifurcationTracer):
         out |= of_circle(self.curve, spot)
         if test.kind == "fold":
             frame = spot.look.tangent
-            out[CUSP] = float((frame @ place.along) @ frame[:, -2:] @ place.heading)
+            out[CUSP] = float((frame @ place.tangent) @ frame[:, -2:] @ place.heading)
         if test.kind == "Neimark-Sacker":
             rho = spot.multipliers[~(trivial(spot.multipliers) & self.curve.autonomous)]
             pairs = [(abs(a * b - 1), (a + b).real / 2) for i, a in enumerate(rho) for b in rho[:i]]

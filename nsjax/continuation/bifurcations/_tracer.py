@@ -2,16 +2,16 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
 from ..._numerics._bracket import bracketed
 from ...orbits.segments._equations import linearised
-from .._step_length import FIRST, next_length, shortened, turn_between, TURNED
+from .._tracer import AbstractTracer, Trace, Zero
 from .._zeros import FAILED, interpolated
-from ..orbits._test_functions import BRANCH, CORNERS, Test
-from ..orbits._tracer import LAST_FOUND, OrbitPoint
+from ..orbits._collapse import floquet
+from ..orbits._test_functions import BRANCH, complex_pair, CORNERS, Test
+from ..orbits._tracer import OrbitPoint, OrbitTracer
 from ..orbits.corners._grazing import cut_itinerary
 from ._surface import AbstractBifurcationTracer, BifurcationTracer, cleared, CUSP, DELTA, Place, RESONANCES, seen_at
 
@@ -23,160 +23,121 @@ RANK = (*CORNERS, *(test.kind for test in RESONANCES), "cusp", "branch", "fold",
 LAST = (*CORNERS, "grazing", "low", "high", "1:1 resonance", "1:2 resonance")  # where the curve ends
 
 
-class Codim2Point(NamedTuple):
-    """What else vanishes at a point of the curve: of codimension two."""
-
-    test: Test
-    others: tuple[Test, ...]
-    spot: OrbitPoint
-    s: float = 0.0
-
-
 @dataclasses.dataclass
-class Trace:
-    """Points one after the other, and what is met at some of them; `end` is the last if it ends the curve."""
+class CurveTracer(AbstractTracer[Place]):
+    """Follows a curve of special points."""
 
-    spots: list[OrbitPoint]
-    met: list[tuple[int, Codim2Point]] = dataclasses.field(default_factory=list)
-    end: Codim2Point | None = None
-    why: str = ""
-    closed: bool = False
+    curve: AbstractBifurcationTracer
 
+    lost = OrbitTracer.lost
+    failures = FAILED
 
-def trace(locus: AbstractBifurcationTracer, place: Place, max_step: float, max_points: int) -> Trace:
-    """Follows the curve from a point in the direction that it has there."""
-    out, begin, length, steps = Trace([place.spot]), place, FIRST, 0
-    while len(out.spots) < max_points:
+    def at(self, point: Place, s: float) -> Place:
+        return self.curve.place(self.curve.step(point, s), point.tangent, point.heading)
 
-        def attempt(length: float, place: Place = place) -> tuple[Place, float, list[Codim2Point]] | None:
-            try:
-                after = locus.place(locus.step(place, length), place.along, place.heading)
-                turn = float(turn_between(place.along, after.along))
-                return None if turn > TURNED else (after, turn, _met(locus, place, after, length))
-            except FAILED:
-                return None
+    def passes(self, zero: Zero) -> bool:
+        return zero.test.kind not in LAST
 
-        step = shortened(length, attempt)
-        if step is None:
-            out.why = LAST_FOUND
-            return out
-        length, (after, turn, found) = step
-        for met in found:
-            # Samples show late that a surface is touched: what lies beyond the exact point is no orbit.
-            while met.test.kind == "grazing" and len(out.spots) > 1 and _beyond(out.spots[-1], met.spot, place):
-                out.spots.pop()
-            out.spots.append(met.spot)
-            out.met.append((len(out.spots) - 1, met))
-            if met.test.kind in LAST:
-                out.end = met
-                return out
-        steps += 1
-        if steps > 3 and _passes(locus, place, begin, length):
-            out.spots.append(begin.spot)
-            out.closed = True
-            return out
-        out.spots.append(after.spot)
-        length = float(next_length(length, turn, after.along, after.spot.look.u, max_step))
-        place = after
-    out.why = f"max_points = {max_points}"
-    return out
+    def closes(self, begin: Place, before: Place, after: Place, length: float) -> bool:
+        s = float(before.tangent @ (begin.u - before.u))
+        if not 0 < s <= length or before.tangent @ begin.tangent < 0.5:
+            return False
+        return bool(np.max(np.abs(self.curve.step(before, s).u - begin.u)) < 1e-6)
 
+    def zeros(self, place: Place, after: Place, length: float, turned: bool) -> list[Zero] | None:
+        """With all that vanishes together."""
+        if turned:
+            return None
+        old, new = self.curve.watched(place), self.curve.watched(after)
+        found = []
+        for test, value in old.items():
+            if test not in new or new[test] == 0 or value * new[test] > 0:
+                continue
+            if test.kind in (*CORNERS, "low", "high") and new[test] > 0:
+                continue  # it comes from where it could not be: a start on the point itself
+            found.append(self.locate(place, after, length, test))
+        found = [zero for zero in found if self.bifurcates(zero)]
+        rank = {kind: i for i, kind in enumerate(RANK)}
+        found.sort(key=lambda zero: zero.s)
+        out: list[Zero] = []
+        while found:
+            near = [zero for zero in found if zero.s - found[0].s <= TOGETHER * length]
+            found = found[len(near) :]
+            first, *others = sorted(near, key=lambda zero: rank.get(zero.test.kind, 99))
+            out.append(first._replace(others=tuple(zero.test for zero in others)))
+            if first.test.kind in LAST:
+                break
+        return out
 
-def _beyond(spot: OrbitPoint, end: OrbitPoint, place: Place) -> bool:
-    """In the parameters: the orbits are cut differently."""
-    return float((spot.look.u[-2:] - end.look.u[-2:]) @ place.along[-2:]) > 0
+    def bifurcates(self, zero: Zero) -> bool:
+        """Two real multipliers with the product 1 bifurcate only where both are 1, or -1."""
+        if zero.test.kind != "Neimark-Sacker":
+            return True
+        rho = zero.point.spot.multipliers
+        at = {"fold": 1.0, "branch": 1.0, "flip": -1.0}.get(self.curve.test.kind)
+        double = at is not None and np.sum(np.abs(rho - at) < 1e-3) >= 2 + (self.curve.curve.autonomous and at == 1)
+        return bool(complex_pair(rho) or double)
 
+    def locate(self, place: Place, after: Place, length: float, test: Test) -> Zero:
+        locus, seen = self.curve, {0.0: place.spot, length: after.spot}
 
-def _passes(locus: AbstractBifurcationTracer, place: Place, begin: Place, length: float) -> bool:
-    s = float(place.along @ (begin.spot.look.u - place.spot.look.u))
-    if not 0 < s <= length or place.along @ begin.along < 0.5:
-        return False
-    return bool(np.max(np.abs(locus.step(place, s).look.u - begin.spot.look.u)) < 1e-6)
+        def step(s: float) -> OrbitPoint:
+            return locus.step(place, s)
 
+        def there(spot: OrbitPoint) -> Place:
+            return dataclasses.replace(place, spot=spot)
 
-def _met(locus: AbstractBifurcationTracer, place: Place, after: Place, length: float) -> list[Codim2Point]:
-    """What vanishes between two points, in its order, up to the end of the curve."""
-    old, new = locus.watched(place), locus.watched(after)
-    found = []
-    for test, value in old.items():
-        if test not in new or new[test] == 0 or value * new[test] > 0:
-            continue
-        if test.kind in (*CORNERS, "low", "high") and new[test] > 0:
-            continue  # it comes from where it could not be: a start on the point itself
-        found.append(_located(locus, place, after, length, test))
-    found = [met for met in found if _bifurcates(locus, met)]
-    rank = {kind: i for i, kind in enumerate(RANK)}
-    found.sort(key=lambda met: met.s)
-    out: list[Codim2Point] = []
-    while found:
-        near = [met for met in found if met.s - found[0].s <= TOGETHER * length]
-        found = found[len(near) :]
-        first, *others = sorted(near, key=lambda met: rank.get(met.test.kind, 99))
-        out.append(first._replace(others=tuple(met.test for met in others)))
-        if first.test.kind in LAST:
-            break
-    return out
+        def value(spot: OrbitPoint) -> float:
+            here = locus.place(spot, place.tangent, place.heading) if test == CUSP else there(spot)
+            return locus.watched(here)[test]
 
+        s, regular = length / 2, test != BRANCH
+        try:
+            if regular:
+                rough = test.kind == "guard"  # the least of samples
+                s = bracketed(seen, step, value, 1e-5 * length if rough else 1e-14)
+                # Where the zeros of the test function cross others of its own, as at a corner at which the orbits turn
+                # round with it, points of the curve are known less and less well.
+                regular = locus.place(seen[s], place.tangent).slope > DEGENERATE * place.slope
+        except FAILED:
+            regular = False
+        if not regular:
+            near = min(seen, key=lambda t: abs(t - s))
+            return self.interpolate(place, max(near, 0.1 * length), length, test, value)
+        spot = seen[s]
+        if test.kind == "guard" and isinstance(locus, BifurcationTracer):
+            exact = _cut(locus, spot, test)
+            if exact is not None:
+                return Zero(s, Test("grazing", test.row, test.slot), there(exact))
+        return Zero(s, test, there(spot))
 
-def _bifurcates(locus: AbstractBifurcationTracer, met: Codim2Point) -> bool:
-    """Two real multipliers with the product 1 bifurcate only where both are 1, or -1."""
-    if met.test.kind != "Neimark-Sacker":
-        return True
-    rho = met.spot.multipliers
-    pair = np.any((np.abs(np.abs(rho) - 1) < 1e-5) & (np.abs(np.imag(rho)) > 1e-6))
-    at = {"fold": 1.0, "branch": 1.0, "flip": -1.0}.get(locus.test.kind)
-    double = at is not None and np.sum(np.abs(rho - at) < 1e-3) >= 2 + (locus.curve.autonomous and at == 1)
-    return bool(pair or double)
+    def interpolate(
+        self, place: Place, s: float, length: float, test: Test, value: Callable[[OrbitPoint], float]
+    ) -> Zero:
+        """A point at which the equations are singular, from points of the curve on both sides of it."""
+        found = interpolated(s, 0.5 * length, lambda s: self.curve.step(place, s), value)
+        u = found.at(lambda here: here.look.u)
+        spot = seen_at(self.curve.curve, place.spot.itinerary, u, place.spot.look.tangent)
+        # So are the multipliers there a limit, of saltation matrices that are none.
+        spot = dataclasses.replace(spot, **floquet(found.at(lambda here: here.monodromy)))
+        return Zero(found.s, test, dataclasses.replace(place, spot=spot))
 
-
-def _located(locus: AbstractBifurcationTracer, place: Place, after: Place, length: float, test: Test) -> Codim2Point:
-    seen: dict[float, OrbitPoint] = {0.0: place.spot, length: after.spot}
-
-    def step(s: float) -> OrbitPoint:
-        return locus.step(place, s)
-
-    def value(spot: OrbitPoint) -> float:
-        here = locus.place(spot, place.along, place.heading) if test == CUSP else dataclasses.replace(place, spot=spot)
-        return locus.watched(here)[test]
-
-    s, regular = length / 2, test != BRANCH
-    try:
-        if regular:
-            rough = test.kind == "guard"  # the least of samples
-            s = bracketed(seen, step, value, 1e-5 * length if rough else 1e-14)
-            # Where the zeros of the test function cross others of its own, as at a corner at which the orbits turn
-            # round with it, points of the curve are known less and less well.
-            regular = locus.place(seen[s], place.along).slope > DEGENERATE * place.slope
-    except FAILED:
-        regular = False
-    if not regular:
-        near = min(seen, key=lambda t: abs(t - s))
-        return _interpolated(locus, place, max(near, 0.1 * length), length, test, value)
-    spot = seen[s]
-    if test.kind == "guard" and isinstance(locus, BifurcationTracer):
-        exact = _cut(locus, spot, test)
-        if exact is not None:
-            return Codim2Point(Test("grazing", test.row, test.slot), (), exact, s)
-    return Codim2Point(test, (), spot, s)
-
-
-def _interpolated(
-    locus: AbstractBifurcationTracer,
-    place: Place,
-    s: float,
-    length: float,
-    test: Test,
-    value: Callable[[OrbitPoint], float],
-) -> Codim2Point:
-    """A point at which the equations are singular, from points of the curve on both sides of it."""
-    found = interpolated(s, 0.5 * length, lambda s: locus.step(place, s), value)
-    u = found.at(lambda here: here.look.u)
-    spot = seen_at(locus.curve, place.spot.itinerary, u, place.spot.look.tangent)
-    # So are the multipliers there a limit, of saltation matrices that are none.
-    monodromy = found.at(lambda here: here.monodromy)
-    rho = np.linalg.eigvals(monodromy)
-    rho = rho[np.argsort(-np.abs(rho))].astype(complex)
-    return Codim2Point(test, (), dataclasses.replace(spot, monodromy=monodromy, multipliers=rho), found.s)
+    def trace(self, place: Place) -> tuple[Trace[Place], list[tuple[int, Zero]]]:
+        """The curve from a point in the direction that it has there, and its zeros, each at which of its points."""
+        trace, met = Trace((place,), begin=place), []
+        while not trace.over:
+            trace = self.further(trace)
+            met += [] if trace.at is None else [(len(trace.points) - 1, trace.at)]
+        end = trace.end
+        if end is not None and end.test.kind == "grazing":
+            # Samples show late that a surface is touched: what lies beyond the exact point, in the plane of the
+            # parameters, is no orbit.
+            points = trace.points[:-1]
+            while len(points) > 1 and (points[-1].u[-2:] - end.point.u[-2:]) @ end.point.tangent[-2:] > 0:
+                points = points[:-1]
+            trace = dataclasses.replace(trace, points=(*points, end.point))
+            met[-1] = len(points), end
+        return trace, met
 
 
 def _cut(locus: BifurcationTracer, spot: OrbitPoint, test: Test) -> OrbitPoint | None:

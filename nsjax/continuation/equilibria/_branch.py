@@ -1,7 +1,5 @@
 """Branches of equilibria."""
 
-import dataclasses
-
 import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
@@ -11,12 +9,9 @@ from ..._types import Y
 from ...setvalued._crossing import EigenvalueCrossing
 from ...system._system import System
 from .._archive import table
-from .._branch import AbstractBranch, descends
+from .._branch import AbstractBranch, BranchSegment, descends
 from ._bifurcation import Bifurcation, HalfBranch, unstable_number
-from ._equations import Record
-
-
-CLOSED = "the start: it is closed"
+from ._equations import EquilibriumCurve
 
 
 @shown
@@ -59,52 +54,25 @@ class Branch(AbstractBranch[Bifurcation]):
 Branch.saved = table(Branch, Bifurcation, HalfBranch, EigenvalueCrossing)
 
 
-@dataclasses.dataclass
-class BranchSegment:
-    """Points one after the other, and the special ones among them, while they are found."""
-
-    records: list[Record] = dataclasses.field(default_factory=list)
-    modes: list[np.ndarray] = dataclasses.field(default_factory=list)
-    special: list[tuple[int, Bifurcation]] = dataclasses.field(default_factory=list)
-    end: str = ""
-
-    def add(self, record: Record, mode: np.ndarray) -> None:
-        self.records.append(record)
-        self.modes.append(mode)
-
-    def note(self, bifurcation: Bifurcation) -> None:
-        self.special.append((len(self.records) - 1, bifurcation))
-
-    def reversed(self) -> "BranchSegment":
-        last = len(self.records) - 1
-        return BranchSegment(
-            self.records[::-1], self.modes[::-1], [(last - i, b) for i, b in self.special[::-1]], self.end
-        )
-
-    def closed(self) -> bool:
-        return self.end == CLOSED
-
-
-def branch_of(system: System, parameter: str, back: BranchSegment, ahead: BranchSegment) -> Branch:
+def branch_of(curve: EquilibriumCurve, parameter: str, back: BranchSegment, ahead: BranchSegment) -> Branch:
     """Two segments that set out from one point as one branch: upwards, if there is a choice."""
     ends = (back.end, ahead.end)
-    back = back.reversed()
+    back, keep = back.reversed(), len(back.points)
     # The common point is there once, or, where eigenvalues jump, from both sides.
-    corner = bool(back.special) and back.special[-1][0] == len(back.records) - 1 and back.special[-1][1].discontinuous
-    keep = len(back.records) - (0 if corner else 1)
-    segment = BranchSegment(back.records[: max(keep, 0)] + ahead.records, back.modes[: max(keep, 0)] + ahead.modes)
-    segment.special = [(i, b) for i, b in back.special if i < keep]
-    last = segment.special[-1][1] if corner and segment.special else None
-    segment.special += [(i + max(keep, 0), b) for i, b in ahead.special if b is not last or i > 0]
-    if descends([record.parameter for record in segment.records]):
+    corner = bool(back.special) and back.special[-1][0] == keep - 1 and back.special[-1][1].discontinuous
+    keep = max(keep - (0 if corner else 1), 0)
+    last = next((b for i, b in back.special[::-1] if corner and i < keep), None)
+    segment = back.join(ahead, keep, last)
+    if descends([point.parameter for point in segment.points]):
         segment, ends = segment.reversed(), ends[::-1]
-    tree = jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *segment.records)
+    records = [point.record for point in segment.points]
+    tree = jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *records)
     return Branch(
-        system=system,
+        system=curve.model.system,
         parameter=parameter,
         values=tree.parameter,
         ys=tree.y,
-        modes=np.stack([mode[0] for mode in segment.modes]),
+        modes=np.stack([point.mode[0] for point in segment.points]),
         multipliers=tree.multipliers,
         eigenvalues=tree.eigenvalues,
         unstable=unstable_number(tree.eigenvalues),

@@ -1,7 +1,7 @@
 """Points at which branches meet: corners, where they cross surfaces, and simple branch points."""
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -9,9 +9,10 @@ import numpy as np
 
 from ...setvalued._crossing import EigenvalueCrossing
 from ...setvalued._eigenvalue_crossings import eigenvalue_crossings
+from .._tracer import Zero
 from ._bifurcation import Bifurcation, classify, HalfBranch, kind_by_count, odd_one, unstable_number
 from ._corrector import branching, kept, linearised, near, row_sizes, Step, step_along
-from ._equations import EquilibriumCurve, first_lyapunov_coefficient
+from ._equations import EquilibriumCurve, first_lyapunov_coefficient, Record
 
 
 ACTIVE = 1e-8  # distance at which a point lies on a surface: it is located to some 1e-12
@@ -22,7 +23,25 @@ CONTINUUM = 1e-12  # a smaller change of the parameter in such a step counts as 
 MODES = 6561  # the largest number of combinations of sides that are tried
 
 
-@dataclasses.dataclass
+class EquilibriumPoint(NamedTuple):
+    """A point of a branch: the unknowns, the tangent, the mode, what is kept of it, and the step that led to it."""
+
+    u: Any
+    tangent: Any
+    mode: np.ndarray
+    record: Record
+    step: Step | None = None
+
+    @property
+    def parameter(self) -> float:
+        return float(self.record.parameter)
+
+    @property
+    def turned(self) -> "EquilibriumPoint":
+        return self._replace(tangent=-self.tangent)
+
+
+@dataclasses.dataclass(eq=False)
 class Departure:
     """A half-branch, with what it takes to follow it."""
 
@@ -35,7 +54,11 @@ class Departure:
     unstable: int
     index: int
     partner: "Departure | None" = None
-    used: bool = False
+
+    @property
+    def leads_on(self) -> bool:
+        """Not along one value of the parameter."""
+        return self.side != 0
 
 
 @dataclasses.dataclass
@@ -46,8 +69,8 @@ class Node:
     halves: list[Departure]
     bifurcation: Bifurcation
 
-    def is_at(self, curve: EquilibriumCurve, u: Any) -> bool:
-        here, there = curve.parts(self.u), curve.parts(u)
+    def is_at(self, zero: Zero[EquilibriumPoint], curve: EquilibriumCurve) -> bool:
+        here, there = curve.parts(self.u), curve.parts(zero.point.u)
         x = jnp.abs(here[0] - there[0]) / curve.units[: len(here[0])]
         return bool((jnp.max(x) < NEAR) & (jnp.abs(here[2] - there[2]) / curve.units[-1] < NEAR))
 

@@ -1,47 +1,19 @@
-"""Solution curves of N equations for N + 1 unknowns: the compiled parts of a pseudo-arclength continuation."""
+"""Curves of equilibria, N equations for N + 1 unknowns: the compiled parts of a pseudo-arclength continuation."""
 
-import abc
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ..._numerics._compile import interactive
 from ..._numerics._linalg import bialternate
 from ..._numerics._root import find_root, Newton
+from ._equations import EquilibriumCurve as Curve
 
 
-# Test functions, before those of the guards. A curve leaves its interval at LOW and HIGH, and passes the parameter's
-# value at the start at MARK; FOLD is the parameter's part of the tangent, BRANCH the determinant of the equations
-# bordered by the tangent, PAIR a product of all sums of two eigenvalues.
-LOW, HIGH, MARK, FOLD, BRANCH, PAIR, GUARDS = range(7)
 TOLERANCE = 1e-12
-
-
-class Curve(eqx.Module):
-    """Equations for unknowns `u`, in units in which lengths along the curve are measured. The last is the parameter,
-    from 0 at the lower end of its interval to 1 at the upper one. In each of several modes they are smooth."""
-
-    mark: eqx.AbstractVar[Float[Array, ""]]
-
-    @abc.abstractmethod
-    def residual(self, u: Float[Array, " n+1"], mode: Int[Array, "..."]) -> Float[Array, " n"]:
-        """What vanishes on the curve."""
-
-    @abc.abstractmethod
-    def guards(self, u: Float[Array, " n+1"]) -> Float[Array, " guards"]:
-        """Functions at whose zeros the mode may change."""
-
-    @abc.abstractmethod
-    def motion(self, u: Float[Array, " n+1"], mode: Int[Array, "..."]) -> Float[Array, "m m"]:
-        """A matrix of whose eigenvalues two have the sum zero where a pair is on the imaginary axis."""
-
-    @abc.abstractmethod
-    def record(self, u: Float[Array, " n+1"], mode: Int[Array, "..."]) -> Any:
-        """What is kept of a point."""
 
 
 class Probe(NamedTuple):
@@ -138,7 +110,15 @@ class Place(NamedTuple):
 
 @interactive
 def locate(
-    curve: Curve, step: Step, origin: Array, tangent: Array, ends: Array, mode: Array, which: Array, *, slope: Array
+    curve: Curve,
+    step: Step,
+    origin: Array,
+    tangent: Array,
+    ends: Array,
+    mode: Array,
+    which: Array,
+    *,
+    slope: Array,
 ) -> Place:
     """Where between the distances `ends` along `tangent` a test function, or its derivative, is zero: by bisection,
     which needs no derivative of it, on the curve, whose equations are regular there."""

@@ -25,7 +25,6 @@ from ...system._model import SwitchedSystem
 from ...system._parameter import put_parameter
 from ...system._relay import relay
 from ...system._sgn import sgn
-from ._corrector import Curve
 
 
 KINK = 1e-7  # what a switch does at its surface, relative to what it does elsewhere, where the field is continuous
@@ -43,10 +42,13 @@ class Record(NamedTuple):
     stable: Bool[Array, ""]
 
 
-class EquilibriumCurve(Curve):
-    """f(y, s) = 0 with the state, the values of the switches that can hold it, and the parameter as unknowns.
+class EquilibriumCurve(eqx.Module):
+    """f(y, s) = 0 with the state, the values of the switches that can hold it, and the parameter as unknowns `u`, in
+    units in which lengths along the curve are measured. The parameter is the last, from 0 at the lower end of its
+    interval to 1 at the upper one; `mark` is what it is at the start.
 
     A mode has the modes of the switches in its first row, and in its second the component of h on which each is held.
+    In each mode the equations are smooth.
     """
 
     model: SwitchedSystem
@@ -72,15 +74,18 @@ class EquilibriumCurve(Curve):
         return ModeState.of(mode[0], [p if n > 1 else None for p, n in zip(mode[1], self.model.parts)])
 
     def residual(self, u: Array, mode: Array) -> Array:
+        """What vanishes on the curve."""
         model, y, sigma = self.at(u)
         return balance(model, self.t, y, sigma, self.state(mode))
 
     def motion(self, u: Array, mode: Array) -> Array:
+        """A matrix of whose eigenvalues two have the sum zero where a pair is on the imaginary axis."""
         model, y, sigma = self.at(u)
         state = self.state(mode)
         return linear_motion(model, self.t, y, state, switch_values(model, self.t, state, sigma))[1]
 
     def record(self, u: Array, mode: Array) -> Record:
+        """What is kept of a point."""
         model, y, sigma = self.at(u)
         state = self.state(mode)
         values = switch_values(model, self.t, state, sigma)
@@ -93,6 +98,7 @@ class EquilibriumCurve(Curve):
     # is left to the bounds of its value, and to ±1 if it holds beyond. Of a relay both surfaces.
 
     def guards(self, u: Array) -> Array:
+        """Functions at whose zeros the mode may change."""
         model, y, sigma = self.at(u)
         rows: list[Any] = []
         for k, switch in enumerate(model.switches):

@@ -143,12 +143,10 @@ class OrbitBifurcation(AbstractSpecialPoint):
         born = [h for h in halves if h.laps == 2] if kind == "flip" else _twins(halves)
         if kind in ("flip", "symmetry breaking") and born:
             criticality = "supercritical" if born[0].stable else _criticality(spot, born[0])
-        return cls(
-            kind=kind, discontinuous=False, criticality=criticality, evidence="both" if halves else "crossing",
-            by_count="none" if alone else kind, by_crossing=(kind,), transition=None, count=(below, above), surfaces=(),
-            crossings=[],
-            multipliers=(spot.multipliers, spot.multipliers), monodromies=(spot.monodromy, spot.monodromy),
-            halves=halves, origin=Origin(Test(SMOOTH.get(kind, "branch")), spot, curve), **_common(name, spot, curve),
+        return _made(
+            name, spot, curve, kind, (below, above), discontinuous=False, criticality=criticality, halves=halves,
+            evidence="both" if halves else "crossing", by_count="none" if alone else kind, by_crossing=(kind,),
+            origin=Origin(Test(SMOOTH.get(kind, "branch")), spot, curve),
         )  # fmt: skip
 
     @classmethod
@@ -170,11 +168,10 @@ class OrbitBifurcation(AbstractSpecialPoint):
             pairs = [k for k in by_crossing if k not in ("fold", "flip")]
             if kind == "none" and pairs:
                 kind, evidence = pairs[0], "crossing"
-        return cls(
-            kind=kind, discontinuous=True, criticality=by_count.criticality, evidence=evidence, by_count=by_count.kind,
-            by_crossing=by_crossing, transition=transition,
-            count=(by_count.below, by_count.above), surfaces=surfaces, crossings=crossings or [], halves=halves,
-            multipliers=multipliers, monodromies=monodromies, **_common(name, spot, curve),
+        return _made(
+            name, spot, curve, kind, (by_count.below, by_count.above), criticality=by_count.criticality, halves=halves,
+            evidence=evidence, by_count=by_count.kind, by_crossing=by_crossing, transition=transition,
+            surfaces=surfaces, crossings=crossings or [], multipliers=multipliers, monodromies=monodromies,
         )  # fmt: skip
 
     @classmethod
@@ -183,43 +180,42 @@ class OrbitBifurcation(AbstractSpecialPoint):
     ) -> "OrbitBifurcation":
         below, above = (tuple(1 for h in halves if h.side == side) for side in (-1, 1))
         kind = "infinitely unstable fold" if len(below) != len(above) else "none"
-        return cls(
-            kind=kind, discontinuous=True, criticality=None, evidence="both" if kind != "none" else "count",
+        return _made(
+            name, spot, curve, kind, (below, above), evidence="both" if kind != "none" else "count", halves=halves,
             by_count="fold" if kind != "none" else "none", by_crossing=("fold",), transition="sliding",
-            count=(below, above), surfaces=surfaces, crossings=[], halves=halves,
-            multipliers=(halves[0].multipliers, halves[1].multipliers),
-            monodromies=(spot.monodromy, np.full_like(spot.monodromy, np.inf)), **_common(name, spot, curve),
+            surfaces=surfaces, multipliers=(halves[0].multipliers, halves[1].multipliers),
+            monodromies=(spot.monodromy, np.full_like(spot.monodromy, np.inf)),
         )  # fmt: skip
 
     @classmethod
     def hopf(cls, name: str, spot: Any, curve: Any, side: int, criticality: str) -> "OrbitBifurcation":
         """Where the orbits on one side shrink to an equilibrium."""
-        below, above = (((1,) if side == s else ()) for s in (-1, 1))
-        return cls(
-            kind="Hopf", discontinuous=False, criticality=criticality, evidence="both", by_count="Hopf",
-            by_crossing=("Hopf",), transition=None, count=(below, above), surfaces=(), crossings=[], halves=[],
-            multipliers=(spot.multipliers, spot.multipliers), monodromies=(spot.monodromy, spot.monodromy),
-            **_common(name, spot, curve),
-        )  # fmt: skip
+        known = dict(criticality=criticality, evidence="both", by_crossing=("Hopf",))
+        return _made(name, spot, curve, "Hopf", _one_side(side), discontinuous=False, **known)
 
     @classmethod
     def end(
         cls, name: str, spot: Any, curve: Any, surfaces: tuple[str, ...], side: int, kind: str
     ) -> "OrbitBifurcation":
         """Where the orbits on one side have none nearby to go on to, or a continuum."""
-        below, above = (((1,) if side == s else ()) for s in (-1, 1))
-        return cls(
-            kind=kind, discontinuous=True, criticality=None, evidence="count", by_count="end", by_crossing=None,
-            transition=None, count=(below, above), surfaces=surfaces, crossings=[], halves=[],
-            multipliers=(spot.multipliers, spot.multipliers), monodromies=(spot.monodromy, spot.monodromy),
-            **_common(name, spot, curve),
-        )  # fmt: skip
+        return _made(name, spot, curve, kind, _one_side(side), by_count="end", surfaces=surfaces)
 
 
-def _common(name: str, spot: Any, curve: Any) -> dict[str, Any]:
-    look = spot.look
-    y = jfu.ravel_pytree(curve.like)[1](np.asarray(look.x[0]))
-    return dict(parameter=name, value=spot.parameter, period=float(look.period), t=float(look.begin[0]), y=y)
+def _one_side(side: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    return ((1,), ()) if side < 0 else ((), (1,) * (side > 0))
+
+
+def _made(
+    name: str, spot: Any, curve: Any, kind: str, count: tuple[tuple[int, ...], tuple[int, ...]], **given: Any
+) -> OrbitBifurcation:
+    """With what is so at most of them."""
+    look, twice = spot.look, dict(multipliers=(spot.multipliers,) * 2, monodromies=(spot.monodromy,) * 2)
+    point = dict(
+        parameter=name, value=spot.parameter, period=float(look.period), t=float(look.begin[0]),
+        y=jfu.ravel_pytree(curve.like)[1](np.asarray(look.x[0])), discontinuous=True, criticality=None,
+        evidence="count", by_count=kind, by_crossing=None, transition=None, surfaces=(), crossings=[], halves=[],
+    )  # fmt: skip
+    return OrbitBifurcation(kind=kind, count=count, **(point | twice | given))
 
 
 def _twins(halves: Sequence[OrbitHalfBranch]) -> list[OrbitHalfBranch]:

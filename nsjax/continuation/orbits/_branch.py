@@ -20,8 +20,9 @@ from ...setvalued._crossing import EigenvalueCrossing
 from ...system._parameter import parameter_path, put_parameter
 from ...system._system import System
 from .._archive import table
-from .._branch import AbstractBranch, descends
+from .._branch import AbstractBranch, BranchSegment, descends
 from ._bifurcation import OrbitBifurcation, OrbitHalfBranch, Origin
+from ._branch_switching import itinerary_text
 from ._record import states_of
 from ._tracer import midpoint, OrbitPoint
 
@@ -129,59 +130,34 @@ class Point(NamedTuple):
     record: dict[str, np.ndarray]
     admissible: bool
 
-
-@dataclasses.dataclass(frozen=True)
-class OrbitBranchSegment:
-    """Points one after the other, and the special ones among them."""
-
-    points: tuple[Point, ...] = ()
-    special: tuple[tuple[int, OrbitBifurcation], ...] = ()
-    end: str = "here, so far"
-
-    def then(self, point: Point) -> "OrbitBranchSegment":
-        return dataclasses.replace(self, points=(*self.points, point))
-
-    def ending(self, point: Point) -> "OrbitBranchSegment":
-        """With another last point."""
-        return dataclasses.replace(self, points=(*self.points[:-1], point))
-
-    def noting(self, bifurcation: OrbitBifurcation) -> "OrbitBranchSegment":
-        """With the last point as a special one."""
-        return dataclasses.replace(self, special=(*self.special, (len(self.points) - 1, bifurcation)))
-
-    def reversed(self) -> "OrbitBranchSegment":
-        values, last = [point.spot.parameter for point in self.points], len(self.points) - 1
-
-        def index(i: int) -> int:
-            """Of a corner that is there twice, the first of the two."""
-            twice = i < last and math.isclose(values[i + 1], values[i], rel_tol=1e-10)
-            return last - i - 1 if twice else last - i
-
-        return OrbitBranchSegment(self.points[::-1], tuple((index(i), b) for i, b in self.special[::-1]), self.end)
+    @property
+    def parameter(self) -> float:
+        return self.spot.parameter
 
 
-def orbit_branch(
-    curve: OrbitCurve,
-    system: System,
-    parameter: str,
-    back: OrbitBranchSegment,
-    ahead: OrbitBranchSegment,
-    itinerary_text: Any,
-) -> OrbitBranch:
+def _reversed(segment: BranchSegment) -> BranchSegment:
+    """With the first of the two for the index of a corner that is there twice."""
+    found = segment.reversed()
+    values, last = [point.parameter for point in found.points], len(found.points) - 1
+
+    def index(i: int) -> int:
+        twice = 0 < i <= last and math.isclose(values[i], values[i - 1], rel_tol=1e-10)
+        return i - 1 if twice else i
+
+    return dataclasses.replace(found, special=tuple((index(i), b) for i, b in found.special))
+
+
+def orbit_branch(curve: OrbitCurve, parameter: str, back: BranchSegment, ahead: BranchSegment) -> OrbitBranch:
     """Two pieces that set out from one point as one branch: upwards, if there is a choice; a virtual one, away from
     where it begins."""
     ends = (back.end, ahead.end)
-    first, keep = back.reversed(), len(back.points)
+    first, keep = _reversed(back), len(back.points)
     common = bool(first.special and ahead.special) and first.special[-1][1] is ahead.special[0][1]
     if keep and ahead.points and not common:
         keep -= first.points[-1].spot.look.u is ahead.points[0].spot.look.u
-    piece = OrbitBranchSegment(
-        first.points[:keep] + ahead.points,
-        tuple((i, b) for i, b in first.special if i < keep)
-        + tuple((i + keep, b) for i, b in ahead.special if not (common and i == 0)),
-    )
-    if piece.points[0].admissible and descends([point.spot.parameter for point in piece.points]):
-        piece, ends = piece.reversed(), ends[::-1]
+    piece = first.join(ahead, keep, first.special[-1][1] if common else None)
+    if piece.points[0].admissible and descends([point.parameter for point in piece.points]):
+        piece, ends = _reversed(piece), ends[::-1]
     spots = [point.spot for point in piece.points]
 
     def column(rows: list[np.ndarray]) -> Any:
@@ -190,7 +166,7 @@ def orbit_branch(
     bases = [midpoint(curve, spot, spot.itinerary.rows) for spot in spots]
     texts: dict[int, str] = {}
     return OrbitBranch(
-        system=system,
+        system=curve.model.system,
         parameter=parameter,
         values=np.array([spot.parameter for spot in spots]),
         periods=np.array([float(spot.look.period) for spot in spots]),

@@ -12,9 +12,10 @@ from ...orbits.segments._equations import linearised, OrbitCurve
 from ...orbits.segments._itinerary import capacity_for, OrbitItinerary, Start, TIME
 from ...orbits.segments._point import correct, state_at
 from ...system._mode import mode_words
+from .._tracer import Zero
 from ._bifurcation import OrbitBifurcation, OrbitHalfBranch
-from ._test_functions import CORNERS
-from ._tracer import alike, midpoint, OrbitPoint, OrbitTracer, spot_of, test_values, turned, Zero
+from ._test_functions import CORNERS, test_values
+from ._tracer import alike, midpoint, OrbitPoint, OrbitTracer, spot_of
 
 
 BRANCHING = (3e-3, 1e-3, 1e-2, 3e-4, 1e-4, 1e-5)  # lengths of the step by which a branch is entered along its direction
@@ -32,6 +33,11 @@ class Departure:
     side: int
     cycle: Cycle | None = None
     partner: "Departure | None" = None
+
+    @property
+    def leads_on(self) -> bool:
+        """Not out of the interval at once."""
+        return bool(0 <= self.spot.look.u[-1] <= 1)
 
     @property
     def multipliers(self) -> np.ndarray:
@@ -56,7 +62,7 @@ class Node:
     def is_at(self, zero: Zero, curve: OrbitCurve) -> bool:
         """Whether it is this zero of a test function: a smooth bifurcation may be right beside a corner."""
         smooth = zero.test.kind in ("flip", "branch")
-        return smooth != self.bifurcation.discontinuous and together(self.spot, zero.spot, curve, ALIKE)
+        return smooth != self.bifurcation.discontinuous and together(self.spot, zero.point, curve, ALIKE)
 
 
 def together(a: OrbitPoint, b: OrbitPoint, curve: OrbitCurve, tolerance: float) -> bool:
@@ -89,7 +95,7 @@ def set_out(tracer: OrbitTracer, itinerary: OrbitItinerary, u: Any, direction: n
 
 
 def _along(spot: OrbitPoint, direction: np.ndarray) -> OrbitPoint:
-    return spot if float(spot.look.tangent @ direction) >= 0 else turned(spot)
+    return spot if float(spot.look.tangent @ direction) >= 0 else spot.turned
 
 
 def admissible(curve: OrbitCurve, spot: OrbitPoint) -> bool:
@@ -151,7 +157,7 @@ def branch_point_at(tracer: OrbitTracer, name: str, spot: OrbitPoint) -> Node | 
             return None
         node = flip_at(once, name, base)
         if node is not None:
-            for other in (base, turned(base)):
+            for other in (base, base.turned):
                 side = int(np.sign(other.look.tangent[-1]))
                 node.halves.append(Departure(other, once.curve, 1, side))
             node.halves[-1].partner, node.halves[-2].partner = node.halves[-2], node.halves[-1]

@@ -13,8 +13,9 @@ from ...equilibria._find_equilibrium import find_equilibrium
 from ...flow._results import is_okay
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import TIME
+from .._tracer import Trace, Zero
 from ._bifurcation import OrbitBifurcation
-from ._tracer import OrbitPoint, OrbitTracer, Trace, Zero
+from ._tracer import OrbitPoint, OrbitTracer
 
 
 SECANTS = 12  # steps to where the real part is zero
@@ -37,7 +38,7 @@ def hopf_end(name: str, curve: OrbitCurve, trace: Trace) -> tuple[OrbitPoint, Or
     goes back along are the same orbits half a period later. The equations are singular at size zero, and the fold is
     only seen beside the point: that is a zero of the real part of the equilibrium's eigenvalue, which is found here.
     """
-    fold, before, early = trace.spots[-1], trace.spots[-2], trace.spots[-min(5, len(trace.spots))]
+    fold, before, early = trace.points[-1], trace.points[-2], trace.points[-min(5, len(trace.points))]
     small = fold.itinerary.ends[0] == TIME and _size(before) < _size(early)
     if curve.model.system.period is not None or not small:
         return None
@@ -74,7 +75,7 @@ def limits(tracer: OrbitTracer, trace: Trace, zero: Zero) -> Zero:
     At the point the equations do not determine them: whatever is left of the orbit is rounding. Beside it the monodromy
     matrix depends smoothly on the place along the branch; it is a polynomial through five orbits.
     """
-    before, spot = trace.spots[-2], zero.spot
+    before, spot = trace.points[-2], zero.point
     if len(before.look.u) != len(spot.look.u) or _size(spot) > SHRUNK * _size(before):
         return zero
     way = np.asarray(spot.look.u - before.look.u)
@@ -85,10 +86,10 @@ def limits(tracer: OrbitTracer, trace: Trace, zero: Zero) -> Zero:
     # Lagrange's polynomials at zero.
     weights = [np.prod([-x / (a - x) for x in shares if x != a]) for a in shares]
     monodromy = sum(w * np.asarray(m) for w, m in zip(weights, found))
-    return zero._replace(spot=dataclasses.replace(spot, stable=before.stable, **_floquet(monodromy)))
+    return zero._replace(point=dataclasses.replace(spot, stable=before.stable, **floquet(monodromy)))
 
 
-def _floquet(monodromy: np.ndarray) -> dict[str, np.ndarray]:
+def floquet(monodromy: np.ndarray) -> dict[str, np.ndarray]:
     rho = np.linalg.eigvals(monodromy).astype(complex)
     return dict(monodromy=monodromy, multipliers=rho[np.argsort(-np.abs(rho), kind="stable")])
 
@@ -118,4 +119,4 @@ def _point(fold: OrbitPoint, at: _Beside, value: float, y: np.ndarray) -> OrbitP
     still = {part: np.broadcast_to(y, np.shape(getattr(look, part))) for part in ("x", "last", "xs", "low", "high")}
     times = {part: begin + stretch * (getattr(look, part) - begin) for part in ("begin", "end", "ts")}
     look = look._replace(parameter=np.asarray(value), period=period, mean=y, square=y**2, **still, **times)
-    return dataclasses.replace(fold, look=look, **_floquet(expm(np.asarray(at.found.jacobian) * float(period))))
+    return dataclasses.replace(fold, look=look, **floquet(expm(np.asarray(at.found.jacobian) * float(period))))

@@ -1,12 +1,7 @@
 """The continuation of periodic orbits over a parameter, through folds and corners, along every branch."""
 
-import contextlib
-import dataclasses
-import inspect
 import os
-import warnings
-from collections.abc import Callable
-from typing import Any, Generic, ParamSpec
+from typing import Any, Generic
 
 import diffrax as dfx
 import jax.numpy as jnp
@@ -19,47 +14,23 @@ from ...orbits._orbit import Orbit
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import OrbitItinerary
 from ...orbits.segments._point import PointData
-from ...system._model import SwitchedSystem
-from ...system._parameter import get_parameter, parameter_path
+from ...system._parameter import get_parameter
 from ...system._system import System
-from .._archive import Archive, plain, save, table
-from .._progress import ProgressLine
+from .._archive import Archive, plain
+from .._continuation import AbstractContinuation, growth_types, with_arguments_of
+from .._explorer import Tree
 from ._bifurcation import Origin
-from ._branch import orbit_branch, OrbitBranch, OrbitBranchSegment, Point
-from ._branch_switching import Departure, itinerary_text, Node
-from ._explorer import Exit, Frontier, OrbitExplorer, OrbitTree
+from ._branch import orbit_branch, OrbitBranch, Point
+from ._branch_switching import Departure, Node
+from ._explorer import Exit, OrbitExplorer
 from ._record import Measures, Recorder
 from ._start import curve_and_start
 from ._test_functions import Test
-from ._tracer import OrbitPoint, OrbitTracer, Trace, Zero
-
-
-Arguments = ParamSpec("Arguments")
-GIVEN = ("model", "path", "like", "integrator")  # what of a curve follows from the model, and is not saved
-TYPES = {
-    **OrbitBranch.saved,
-    **table(
-        OrbitTree,
-        Frontier,
-        Origin,
-        Exit,
-        Trace,
-        Zero,
-        Test,
-        OrbitPoint,
-        PointData,
-        OrbitItinerary,
-        Node,
-        Departure,
-        Cycle,
-        OrbitBranchSegment,
-        Point,
-    ),
-}
+from ._tracer import OrbitPoint, OrbitTracer
 
 
 @shown
-class OrbitContinuation(Generic[StateT]):
+class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], Generic[StateT]):
     """A continuation that is under way: iterate over it, and look at `branch` at any time.
 
     ```python
@@ -76,6 +47,25 @@ class OrbitContinuation(Generic[StateT]):
     An interrupt (Ctrl-C), wherever it comes, leaves a growth that can be gone on with. The arguments are those of
     `continue_orbit`.
     """
+
+    _parts = OrbitCurve, OrbitTracer, OrbitExplorer
+    _types = growth_types(
+        OrbitBranch,
+        OrbitTracer,
+        Origin,
+        Exit,
+        Test,
+        OrbitPoint,
+        PointData,
+        OrbitItinerary,
+        Node,
+        Departure,
+        Cycle,
+        Point,
+    )
+    _join = staticmethod(orbit_branch)
+
+    _explorer: OrbitExplorer
 
     def __init__(
         self,
@@ -103,65 +93,14 @@ class OrbitContinuation(Generic[StateT]):
         spot = tracer.orbit_near(start.itinerary, curve.pack(start, value))
         if spot is None:
             raise ValueError("Argument `orbit` must be an orbit of `system`, but none was found next to it.")
-        self._explorer = OrbitExplorer(
-            tracer, parameter, max_branches, max_laps * int(curve.order), Recorder(record or {}), virtual
-        )
-        self._tree = self._explorer.first_tree(spot)
-        self._line = ProgressLine() if progress else None
+        max_order = max_laps * int(curve.order)
+        explorer = OrbitExplorer(tracer, parameter, max_branches, max_order, Recorder(record or {}), virtual)
+        upwards = spot if spot.look.tangent[-1] >= 0 else spot.turned
+        self._begin(explorer, explorer.begin(Tree(), upwards), progress)
 
-    def __iter__(self) -> "OrbitContinuation[StateT]":
-        return self
-
-    def __next__(self) -> OrbitPoint:
-        while self._tree.walk is not None:
-            self._tree, point = self._explorer.further(self._tree)
-            if self._tree.walk is None and next(self._tree.places(), None) is not None:
-                warnings.warn(
-                    f"There are more than `max_branches` = {self._explorer.max_branches} branches.", stacklevel=3
-                )
-            if point is not None:
-                if self._line is not None:
-                    self._line.show(self)
-                return point
-        raise StopIteration
-
-    def run(self) -> OrbitBranch[StateT]:
-        """Goes on to the end, and returns the branch."""
-        with contextlib.nullcontext() if self._line is None else self._line:
-            for _ in self:
-                pass
-        return self.branch
-
-    @property
-    def branch(self) -> OrbitBranch[StateT]:
-        """What was found so far."""
-        curve, name = self._explorer.tracer.curve, self._explorer.name
-        found = [orbit_branch(curve, curve.model.system, name, *pair, itinerary_text) for pair in self._tree.branches]
-        return dataclasses.replace(found[0], others=tuple(found[1:]))
-
-    def __str__(self) -> str:
-        pieces = [piece for pair in self._tree.branches for piece in pair]
-        special = {id(found) for piece in pieces for _, found in piece.special}
-        value = next(piece.points[-1].spot.parameter for piece in self._tree.branches[-1] if piece.points)
-        return (
-            f"branch {len(self._tree.branches)}, {sum(len(piece.points) for piece in pieces)} points, "
-            f"{self._explorer.name} = {value:.6g}, {len(special)} special points"
-        )
-
-    def save(self, path: str | os.PathLike) -> None:
-        """Writes all that is known so far to a file, an `.npz` of plain arrays with a description in JSON: at any time,
-        also after an interrupt."""
-        curve, explorer = self._explorer.tracer.curve, self._explorer
-        parts = dict(
-            integrator=plain(repr(curve.integrator)),
-            curve={f.name: getattr(curve, f.name) for f in dataclasses.fields(curve) if f.name not in GIVEN},
-            t0=self._tree.start.look.begin[0],
-            tracer=dict(max_step=explorer.tracer.max_step, max_points=explorer.tracer.max_points),
-            record=sorted(explorer.recorder.measures),
-            explorer={name: getattr(explorer, name) for name in ("name", "max_branches", "max_order", "virtual")},
-            tree=self._tree,
-        )
-        save(path, "OrbitContinuation", TYPES, curve.model.system, curve.like, parts, curve=curve)
+    def _more(self) -> dict[str, Any]:
+        integrator = plain(repr(self._explorer.tracer.curve.integrator))
+        return dict(integrator=integrator, record=sorted(self._explorer.recorder.measures))
 
     @classmethod
     def load(
@@ -190,7 +129,7 @@ class OrbitContinuation(Generic[StateT]):
         **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model or solver
         or with other records.
         """
-        archive = Archive(path, "OrbitContinuation", TYPES, system, y)
+        archive = Archive(path, "OrbitContinuation", cls._types, system, y)
         integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
         if plain(repr(integrator)) != archive.part("integrator"):
             raise ValueError(
@@ -203,33 +142,13 @@ class OrbitContinuation(Generic[StateT]):
                 "Argument `record` must hold functions of the names with which the branch was begun, "
                 f"{archive.part('record')}, but has {sorted(recorder.measures)}."
             )
-        given = archive.part("explorer")
-        curve = OrbitCurve(
-            model=SwitchedSystem.forwards(archive.system, jnp.asarray(archive.part("t0")), archive.y),
-            path=parameter_path(archive.system, given["name"]),
-            like=archive.y,
-            integrator=integrator,
-            **archive.part("curve"),
-        )
-        growth = cls.__new__(cls)
-        growth._explorer = OrbitExplorer(OrbitTracer(curve, **archive.part("tracer")), **given, recorder=recorder)
-        growth._tree = archive.part("tree", curve=curve)
-        growth._line = ProgressLine() if progress else None
+        growth = cls._loaded(archive, progress, dict(integrator=integrator), dict(recorder=recorder))
         for name, value in growth._tree.branches[0][1].points[0].record.items():
             recorder.shapes[name] = value.shape
         return growth
 
 
-def _with_arguments_of(
-    begin: Callable[Arguments, OrbitContinuation[StateT]], fn: Callable[..., Any]
-) -> Callable[Arguments, OrbitBranch[StateT]]:
-    """A function that hands its arguments on shows them to people and to type checkers: with both given at once, as
-    otherwise those lose the type of the state."""
-    vars(fn)["__signature__"] = inspect.signature(begin).replace(return_annotation=OrbitBranch)
-    return fn
-
-
-@lambda fn: _with_arguments_of(OrbitContinuation, fn)
+@lambda fn: with_arguments_of(OrbitContinuation, fn, OrbitBranch)
 def continue_orbit(*args: Any, **kwargs: Any) -> OrbitBranch:
     """Follows a periodic orbit while a parameter varies, through smooth and discontinuous bifurcations, and along the
     branches that are born there.

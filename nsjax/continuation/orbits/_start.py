@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
@@ -17,18 +16,10 @@ from ...orbits.segments._segment_flow import exactness, fits, NEVER, SegmentFlow
 from ...system._model import SwitchedSystem
 from ...system._parameter import get_parameter, parameter_path
 from ...system._system import arrays_of, System
+from .._checks import check_interval, check_precision, checked_scale
 
 
 AT_REST = 1e-9  # a state that varies less is known to few digits only
-
-
-def check_precision(orbit: Orbit) -> None:
-    dtype = jnp.result_type(orbit.t0)
-    if dtype != jnp.float64:
-        raise ValueError(
-            f"Continuation locates special points to more digits than {dtype} has: call "
-            '`jax.config.update("jax_enable_x64", True)` first, and find `orbit` in double precision.'
-        )
 
 
 def curve_and_start(
@@ -37,17 +28,13 @@ def curve_and_start(
     """The curve, in units of the orbit, and the orbit with its itinerary."""
     path = parameter_path(system, parameter)
     low, high = (float(x) for x in interval)
-    check_precision(orbit)
+    check_precision(jnp.result_type(orbit.t0), "find `orbit`")
     if not bool(is_okay(orbit.result)) or not bool(orbit.admissible):
         raise ValueError("Argument `orbit` must be an orbit that was found, and is admissible, but is not.")
     system = arrays_of(system, jnp.float64)
     value = float(get_parameter(system, path))
-    if not low < high or not low <= value <= high:
-        raise ValueError(
-            f"Argument `interval` must be (low, high) and hold {value:.6g}, the value of `{parameter}` in "
-            f"`system`, but is ({low:.6g}, {high:.6g})."
-        )
-    told = None if scale is None else _checked_scale(orbit.y0, scale)
+    check_interval("interval", (low, high), value, f"of `{parameter}` in `system`")
+    told = None if scale is None else checked_scale(orbit.y0, scale)
     model = SwitchedSystem.forwards(system, orbit.t0, orbit.y0)
     (start,) = starts_of(model, [orbit])
     n = len(start.x[0])
@@ -93,13 +80,6 @@ def _exact(curve: OrbitCurve, start: Start, value: float) -> int:
         return NEVER
     flow, rows = _segments(curve, start, value)
     return curve.exact if all(bool(fits(flow, *row)) for row in rows) else NEVER
-
-
-def _checked_scale(like: Y, scale: Y) -> np.ndarray:
-    sizes, x = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(y)]) for y in (scale, like))
-    if sizes.shape != x.shape or not np.all(np.abs(sizes) > 0):
-        raise ValueError("Argument `scale` must hold a positive number for each component of the state.")
-    return np.abs(sizes).astype(np.float64)
 
 
 def _sizes(curve: OrbitCurve, start: Start, value: float) -> np.ndarray:

@@ -5,6 +5,8 @@ Each is written once, in the namespace of its arrays: NumPy's for a point that i
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ...derivatives._floquet import trivial
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import EVENT, GRAZING, OrbitItinerary, REPELLING_EXIT
@@ -25,6 +27,13 @@ class Test(NamedTuple):
 
 BRANCH = Test("branch")
 CIRCLE = (Test("flip"), Test("Neimark-Sacker"))
+
+
+def complex_pair(multipliers: np.ndarray) -> bool:
+    """Whether two of them are on the circle, and not real, as at a Neimark-Sacker point: real ones with the product 1
+    are another zero of its test function."""
+    on = np.abs(np.abs(multipliers) - 1) < 1e-5
+    return bool(np.any(on & (np.abs(np.imag(multipliers)) > 1e-6)))
 
 
 def corner_tests(rows: int, slots: int) -> list[Test]:
@@ -67,3 +76,21 @@ def circle_values(multipliers: Any, autonomous: bool) -> Any:
     off = xp.where(counts[first] & counts[second], rho[first] * rho[second] - 1, 1)
     pairs = off / (1 + xp.abs(off)).astype(rho.dtype)
     return xp.stack([xp.prod(flip), xp.prod(pairs)]).real
+
+
+def test_values(curve: OrbitCurve, spot: Any, log: float) -> dict[Test, float]:
+    """All test functions of a point; the determinant is divided by exp(log)."""
+    share = float(spot.look.u[-1])
+    ends = {Test("low"): share, Test("high"): 1 - share}
+    smooth = {Test("fold"): float(spot.look.tangent[-1]), BRANCH: float(branch_value(spot.look, log))}
+    return ends | of_corners(curve, spot) | smooth | of_circle(curve, spot)
+
+
+def of_corners(curve: OrbitCurve, spot: Any) -> dict[Test, float]:
+    values, there = corner_values(curve, spot.look, spot.itinerary)
+    names = corner_tests(*spot.look.least.shape)
+    return {names[i]: float(values[i]) for i in np.flatnonzero(there)}
+
+
+def of_circle(curve: OrbitCurve, spot: Any) -> dict[Test, float]:
+    return dict(zip(CIRCLE, circle_values(spot.multipliers, curve.autonomous).tolist()))

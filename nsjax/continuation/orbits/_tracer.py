@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,22 +12,11 @@ from ...orbits.segments._corrector import Plane
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import OrbitItinerary, returning
 from ...orbits.segments._point import correct, PointData, state_at
-from .._step_length import FIRST, next_length, shortened, turn_between, TURNED
+from .._tracer import AbstractTracer, Zero
 from .._zeros import interpolated
-from ._test_functions import (
-    BRANCH,
-    branch_value,
-    CIRCLE,
-    circle_values,
-    corner_tests,
-    corner_values,
-    CORNERS,
-    PASSED,
-    Test,
-)
+from ._test_functions import BRANCH, complex_pair, CORNERS, PASSED, Test, test_values
 
 
-LAST_FOUND = "the last orbit that could be found"
 UNSEEN = 1e-6  # steps that are not shortened any more for the sake of a branch point
 NEAR = 1e-5  # zeros that are nearer to each other, in steps, are one
 ON = 1e-11  # an orbit of which a test function is smaller in size is on the corner, on whichever side of it by rounding
@@ -48,8 +37,22 @@ class OrbitPoint:
     monodromy: np.ndarray
 
     @property
+    def u(self) -> Any:
+        return self.look.u
+
+    @property
+    def tangent(self) -> Any:
+        return self.look.tangent
+
+    @property
     def parameter(self) -> float:
         return float(self.look.parameter)
+
+    @property
+    def turned(self) -> "OrbitPoint":
+        look = self.look
+        branch = look.branch * np.array([-1, 1])  # the sign of a determinant of which the tangent is a row
+        return dataclasses.replace(self, look=look._replace(tangent=-look.tangent, branch=branch))
 
 
 def spot_of(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary) -> OrbitPoint:
@@ -70,78 +73,16 @@ def midpoint(curve: OrbitCurve, spot: OrbitPoint, rows: Iterable[int]) -> tuple[
     return t, state_at(curve, itinerary, look, best, t), np.asarray(itinerary.mode[best])
 
 
-def test_values(curve: OrbitCurve, spot: OrbitPoint, log: float) -> dict[Test, float]:
-    """All test functions of a point; the determinant is divided by exp(log)."""
-    share = float(spot.look.u[-1])
-    ends = {Test("low"): share, Test("high"): 1 - share}
-    smooth = {Test("fold"): float(spot.look.tangent[-1]), BRANCH: float(branch_value(spot.look, log))}
-    return ends | of_corners(curve, spot) | smooth | of_circle(curve, spot)
-
-
-def of_corners(curve: OrbitCurve, spot: OrbitPoint) -> dict[Test, float]:
-    values, there = corner_values(curve, spot.look, spot.itinerary)
-    names = corner_tests(*spot.look.least.shape)
-    return {names[i]: float(values[i]) for i in np.flatnonzero(there)}
-
-
-def of_circle(curve: OrbitCurve, spot: OrbitPoint) -> dict[Test, float]:
-    return dict(zip(CIRCLE, circle_values(spot.multipliers, curve.autonomous).tolist()))
-
-
-class Zero(NamedTuple):
-    """The zero of a test function: where, what else vanishes there, and on which side of its parameter the branch was
-    before."""
-
-    s: float
-    test: Test
-    spot: OrbitPoint
-    others: tuple[Test, ...] = ()
-    side: int = 0
-
-
-@dataclasses.dataclass(frozen=True)
-class Trace:
-    """Points one after the other, up to one at which their itinerary ends. It is a value: `OrbitTracer.further` makes
-    the next from it.
-
-    - `spots`: the points.
-    - `begin`: a point at which it has been all round.
-    - `length`, `steps`: of the next step; how many there were.
-    - `ahead`: points that the last step found, and that are to come: zeros, and where it ends.
-    - `at`: what vanishes at the last point.
-    - `why`, `closed`: why there is no other; whether because it has been all round.
-    """
-
-    spots: tuple[OrbitPoint, ...]
-    begin: OrbitPoint | None = None
-    length: float = FIRST
-    steps: int = 0
-    ahead: tuple[OrbitPoint | Zero, ...] = ()
-    at: Zero | None = None
-    why: str = ""
-    closed: bool = False
-
-    @property
-    def end(self) -> Zero | None:
-        """That with which the itinerary ends."""
-        return None if self.at is None or self.at.test.kind in PASSED else self.at
-
-    @property
-    def over(self) -> bool:
-        return not self.ahead and bool(self.end or self.closed or self.why)
-
-
 @dataclasses.dataclass
-class OrbitTracer:
+class OrbitTracer(AbstractTracer[OrbitPoint]):
     """Follows branches; virtual ones to the ends of the interval, whatever they meet."""
 
     curve: OrbitCurve
-    max_step: float
-    max_points: int
     virtual: bool = False
 
+    lost = "the last orbit that could be found"
+
     def at(self, spot: OrbitPoint, s: float, guess: Any = None) -> OrbitPoint | None:
-        """The point at the distance `s` along the tangent of another."""
         found = correct(self.curve, spot.itinerary, Plane(spot.look.u, spot.look.tangent, s), guess)
         return spot_of(self.curve, found, spot.itinerary) if bool(found.good) else None
 
@@ -164,48 +105,15 @@ class OrbitTracer:
         found = correct(self.curve, itinerary, Plane(guess, border))
         return spot_of(self.curve, found, itinerary) if bool(found.good) else None
 
-    def further(self, trace: Trace) -> Trace:
-        """The trace with one point more, or with the reason why there is none."""
-        if not trace.ahead:
-            trace = self.next_step(trace)
-        if not trace.ahead:
-            return trace
-        here, *ahead = trace.ahead
-        zero = here if isinstance(here, Zero) else None
-        spot = here.spot if isinstance(here, Zero) else here
-        return dataclasses.replace(trace, spots=(*trace.spots, spot), ahead=tuple(ahead), at=zero)
+    def passes(self, zero: Zero) -> bool:
+        return zero.test.kind in PASSED
 
-    def next_step(self, trace: Trace) -> Trace:
-        """The next step along the tangent at the last point, as long as it can be."""
-        spot = trace.spots[-1]
-        if len(trace.spots) >= self.max_points:
-            return dataclasses.replace(trace, why=f"max_points = {self.max_points}, at {spot.parameter:.10g}")
+    def select(self, point: OrbitPoint, zeros: list[Zero], length: float) -> tuple[Zero, ...]:
+        return tuple(
+            zero for zero in zeros if zero.test.kind != "Neimark-Sacker" or complex_pair(zero.point.multipliers)
+        )
 
-        back = returning(self.curve.model, spot.itinerary)
-
-        def attempt(length: float) -> tuple[OrbitPoint, float, list[Zero]] | None:
-            step = self.at(spot, length)
-            if step is None or any(abs(step.look.end[i] - step.look.begin[i]) < ON for i in back):
-                return None
-            turn = float(turn_between(spot.look.tangent, step.look.tangent))
-            zeros = self.zeros(spot, step, length) if turn <= TURNED else None
-            return None if zeros is None else (step, turn, zeros)
-
-        found = shortened(trace.length, attempt)
-        if found is None:
-            return dataclasses.replace(trace, why=f"{LAST_FOUND}, at {spot.parameter:.10g}")
-        length, (step, turn, zeros) = found
-        zeros = tuple(z for z in zeros if z.test.kind != "Neimark-Sacker" or _complex_pair(z.spot))
-        if zeros and zeros[-1].test.kind not in PASSED:
-            return dataclasses.replace(trace, ahead=zeros)
-        steps = trace.steps + 1
-        if trace.begin is not None and steps > 3 and self.passes(trace.begin, spot, step):
-            return dataclasses.replace(trace, ahead=(*zeros, trace.begin), closed=True)
-        length = float(next_length(length, turn, step.look.tangent, step.look.u, self.max_step))
-        return dataclasses.replace(trace, ahead=(*zeros, step), length=length, steps=steps)
-
-    def passes(self, begin: OrbitPoint, spot: OrbitPoint, step: OrbitPoint) -> bool:
-        """Whether another orbit lies on the curve between two points."""
+    def closes(self, begin: OrbitPoint, spot: OrbitPoint, step: OrbitPoint, length: float) -> bool:
         value, upwards = begin.parameter, step.parameter > spot.parameter
         if not min(spot.parameter, step.parameter) <= value < max(spot.parameter, step.parameter):
             return False
@@ -214,15 +122,19 @@ class OrbitTracer:
         here = self.between(spot, step, value)
         return here is not None and alike(here, begin, self.curve, SAME)
 
-    def zeros(self, spot: OrbitPoint, step: OrbitPoint, length: float) -> list[Zero] | None:
-        """The zeros of test functions between two points, in their order, up to the first at which the itinerary ends;
-        None if the step must be shorter for them to be told."""
+    def zeros(self, spot: OrbitPoint, step: OrbitPoint, length: float, turned: bool) -> list[Zero] | None:
+        """Up to the first at which the itinerary ends."""
+        back = returning(self.curve.model, spot.itinerary)
+        if turned or any(abs(step.look.end[i] - step.look.begin[i]) < ON for i in back):
+            return None
         scale = float(spot.look.branch[1])
         found, lost = self.sign_changes(spot, step, length, scale)
         for test in lost:
             # Beside a singular point, which another test function may know.
             small = SINGULAR if test == BRANCH else VANISHES
-            at = next((z for z in found if abs(test_values(self.curve, z.spot, scale).get(test, np.inf)) < small), None)
+            at = next(
+                (z for z in found if abs(test_values(self.curve, z.point, scale).get(test, np.inf)) < small), None
+            )
             if at is None and (test != BRANCH or length > UNSEEN):
                 return None
             found += [] if at is None else [at._replace(test=test)]
@@ -290,14 +202,14 @@ class OrbitTracer:
         where is known the less: what is zero at the other one too was found too soon."""
         if abs(other.s - zero.s) < near:
             return True
-        least = other.spot.look.least[zero.test.row, zero.test.slot]
+        least = other.point.look.least[zero.test.row, zero.test.slot]
         return zero.test.kind == "guard" and other.test.kind in CORNERS and abs(float(least)) < ON
 
     def short_of(self, spot: OrbitPoint, zero: Zero, off: float) -> tuple[float, OrbitPoint]:
         """The point a given distance before a zero on the way from another point; or the zero."""
         s = zero.s - off
-        here = None if s <= 0 else self.at(spot, s, spot.look.u + s / zero.s * (zero.spot.look.u - spot.look.u))
-        return (zero.s, zero.spot) if here is None else (s, here)
+        here = None if s <= 0 else self.at(spot, s, spot.look.u + s / zero.s * (zero.point.look.u - spot.look.u))
+        return (zero.s, zero.point) if here is None else (s, here)
 
     def with_others(self, before: OrbitPoint, zero: Zero, together: list[Zero]) -> Zero:
         """What vanishes at one point, by the first of `CORNERS`."""
@@ -305,15 +217,9 @@ class OrbitTracer:
         several = sorted([zero, *together], key=lambda z: rank.get(z.test.kind, 99))
         first = several[0]
         others = tuple(dict.fromkeys(z.test for z in several[1:]))
-        off = before.parameter - first.spot.parameter
+        off = before.parameter - first.point.parameter
         side = int(np.sign(off if off else -before.look.tangent[-1]))
         return first._replace(others=others, side=side)
-
-    def value(self, spot: OrbitPoint, test: Test, scale: float) -> float:
-        found = test_values(self.curve, spot, scale).get(test)
-        if found is None:
-            raise ArithmeticError(f"{test} is not a number")
-        return found
 
     def locate(self, spot: OrbitPoint, step: OrbitPoint, length: float, test: Test, scale: float) -> Zero | None:
         """By bracketing: the curve is smooth there, and so is the test function, except the least value of a guard."""
@@ -331,8 +237,8 @@ class OrbitTracer:
         s, rough = None, inside
         try:
             xtol = 1e-5 * length if rough else 1e-14
-            s = bracketed(seen, at, lambda here: self.value(here, test, scale), xtol)
-        except ArithmeticError:
+            s = bracketed(seen, at, lambda here: test_values(self.curve, here, scale)[test], xtol)
+        except (ArithmeticError, KeyError):  # beyond where the test function is a number
             pass
         if s is None or test == BRANCH:
             # Beside its zero the equations are singular: the last that could be solved tells about where.
@@ -350,7 +256,7 @@ class OrbitTracer:
         found, place, along = None, spot.look.u + s / length * chord, chord / length
 
         def value(here: OrbitPoint) -> float:
-            size = self.value(here, test, scale)
+            size = test_values(self.curve, here, scale)[test]
             if test.kind == "duration" and abs(size) < ON:
                 raise ArithmeticError("this is an orbit on which the segment has no duration anyway")
             return size
@@ -378,14 +284,3 @@ def alike(a: OrbitPoint, b: OrbitPoint, curve: OrbitCurve, tolerance: float) -> 
     sizes = np.asarray(curve.sizes)
     pairs = ((a.look.mean, b.look.mean, sizes), (a.look.square, b.look.square, sizes**2))
     return all(float(np.max(np.abs(x - y) / size)) < tolerance for x, y, size in pairs)
-
-
-def turned(spot: OrbitPoint) -> OrbitPoint:
-    look = spot.look
-    branch = look.branch * np.array([-1, 1])  # the sign of a determinant of which the tangent is a row
-    return dataclasses.replace(spot, look=look._replace(tangent=-look.tangent, branch=branch))
-
-
-def _complex_pair(spot: OrbitPoint) -> bool:
-    on = np.abs(np.abs(spot.multipliers) - 1) < 1e-5
-    return bool(np.any(on & (np.abs(np.imag(spot.multipliers)) > 1e-6)))

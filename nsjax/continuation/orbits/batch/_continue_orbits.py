@@ -24,8 +24,9 @@ from ....orbits.segments._itinerary import capacity_for, OrbitItinerary, Start, 
 from ....sweeps._sweep import sweep
 from ....system._parameter import get_parameter, parameter_path, put_parameter
 from ....system._system import arrays_of, System
-from .._start import check_precision, curve_and_start, order_of, phase_of
-from .._test_functions import BRANCH, PASSED, Test
+from ..._checks import check_precision
+from .._start import curve_and_start, order_of, phase_of
+from .._test_functions import BRANCH, complex_pair, PASSED, Test
 from ._lane import EACH, ENDED, follow_lane, Lane, lane_tests, LOST, NO_ORBIT
 
 
@@ -140,7 +141,7 @@ def continue_orbits(
     integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
     each = list(orbits) if isinstance(orbits, Sequence) else _unstacked(orbits)
     for one in each:
-        check_precision(one)
+        check_precision(jnp.result_type(one.t0), "find `orbit`")
     path, (low, high) = parameter_path(each[0].system, parameter), interval
     values = [float(get_parameter(one.system, path)) for one in each]
     good = [bool(is_okay(one.result) & one.admissible) and low <= v <= high for one, v in zip(each, values)]
@@ -282,7 +283,7 @@ def _way(curve: OrbitCurve, itineraries: OrbitItinerary, found: Lane, i: int) ->
     for j, word in enumerate(words):
         rho = found.rows.multipliers[i, order[j]]
         # A product of multipliers is 1, as at a Neimark-Sacker point, but they are real.
-        if word == "Neimark-Sacker" and not np.any((np.abs(np.abs(rho) - 1) < 1e-5) & (np.abs(rho.imag) > 1e-6)):
+        if word == "Neimark-Sacker" and not complex_pair(rho):
             words[j] = ""
         if word == "fold" and "branch point" in words[max(0, j - 1) : j + 2]:
             words[j] = ""

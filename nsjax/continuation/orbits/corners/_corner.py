@@ -10,6 +10,7 @@ from ....orbits.segments._equations import linearised, OrbitCurve
 from ....orbits.segments._itinerary import capacity_for, EVENT, GRAZING, REPELLING_EXIT, Start
 from ....setvalued._eigenvalue_crossings import eigenvalue_crossings
 from ....system._impact import impact
+from ..._tracer import Zero
 from .._bifurcation import OrbitBifurcation, Origin
 from .._branch_switching import (
     branch_point_at,
@@ -25,7 +26,7 @@ from .._branch_switching import (
     with_order,
 )
 from .._test_functions import CORNERS
-from .._tracer import midpoint, OrbitPoint, OrbitTracer, Zero
+from .._tracer import midpoint, OrbitPoint, OrbitTracer
 from ._enter_half_branch import half_of, NEIGHBOUR
 from ._return_map import MAX_EVENTS, return_map, ReturnMap, Touch, touches_of
 
@@ -37,13 +38,13 @@ BEYOND = 1e-4  # of the interval, behind the end of a branch: there it is seen w
 def node_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | None:
     """What there is at the zero of a test function; None where nothing is known to begin there."""
     if zero.test.kind == "flip":
-        return flip_at(tracer, name, zero.spot)
+        return flip_at(tracer, name, zero.point)
     if zero.test.kind == "branch":
-        return branch_point_at(tracer, name, zero.spot)
+        return branch_point_at(tracer, name, zero.point)
     if zero.test.kind in (*CORNERS, "grazing"):
         node = corner_at(tracer, name, zero, most)
         if node is not None:
-            node.bifurcation = dataclasses.replace(node.bifurcation, origin=Origin(zero.test, zero.spot, tracer.curve))
+            node.bifurcation = dataclasses.replace(node.bifurcation, origin=Origin(zero.test, zero.point, tracer.curve))
         return node
     return None
 
@@ -52,7 +53,7 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
     """Where the orbit touches the tip of a surface, grazes one, or a segment vanishes or appears."""
     curve = tracer.curve
     kind = zero.test.kind
-    spot = zero.spot
+    spot = zero.point
     shrinks = float(spot.look.period) < KNOWN * float(curve.time)  # to a point
     if kind == "guard" or shrinks:
         return _end(tracer, name, zero)
@@ -88,7 +89,7 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
 
 def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple[OrbitTracer, Zero] | None:
     """The corner of an orbit that is seen several times, seen once: the lap that ends with the first of the places."""
-    curve, look, itinerary = tracer.curve, zero.spot.look, zero.spot.itinerary
+    curve, look, itinerary = tracer.curve, zero.point.look, zero.point.itinerary
     n, whole, last = int(itinerary.num), float(look.period), zero.test.row
     lap, slack = whole / times, KNOWN * whole
     t = look.end[last] - lap
@@ -106,7 +107,7 @@ def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple
     x[0] = look.x[(last + 1) % n]  # what ends here begins anew
     short = itinerary.take(lap_rows, capacity_for(len(lap_rows)))
     once = tracer_for(tracer, with_order(curve, int(curve.order) // times))
-    u = once.curve.pack(Start(short, np.array(begins), np.array(ends), x), zero.spot.parameter)
+    u = once.curve.pack(Start(short, np.array(begins), np.array(ends), x), zero.point.parameter)
     border = np.zeros_like(u)
     border[-1] = 1.0
     if (
@@ -115,10 +116,10 @@ def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple
         at = (len(lap_rows) - 1) * (len(curve.sizes) + 2)
         border[[-1, at, at + 1]] = 0.0, -1.0, 1.0
     spot = once.orbit_near(short, u, border)
-    if spot is None or not together(spot, zero.spot, curve, NEIGHBOUR):
+    if spot is None or not together(spot, zero.point, curve, NEIGHBOUR):
         return None
     tests = [t._replace(row=lap_rows.index(t.row)) for t in (zero.test, *zero.others) if t.row in lap_rows]
-    return once, zero._replace(spot=spot, test=tests[0], others=tuple(tests[1:]))
+    return once, zero._replace(point=spot, test=tests[0], others=tuple(tests[1:]))
 
 
 def is_impact(curve: OrbitCurve, spot: OrbitPoint, row: int) -> bool:
@@ -147,8 +148,7 @@ def _through(corner: CornerMap, side: int, arrived: tuple[int, ...]) -> Cycles:
         step, shift = corner.a[p] @ step, corner.a[p] @ shift + corner.b[p]
     x = np.linalg.solve(np.eye(n) - step, shift)
     rates = np.stack([a @ x + b for a, b in before])
-    rho = np.linalg.eigvals(step)
-    rho = rho[np.argsort(-np.abs(rho))].astype(complex)
+    rho = _multipliers(step).astype(complex)
     none, stable = np.zeros(m), bool(np.all(np.abs(rho) < 1))
     words = ((side, arrived), (-side, tuple(1 - w for w in arrived)))
     found = tuple(Cycle(s, 1, word, s * rates, none, none, rho, stable) for s, word in words)
@@ -292,10 +292,10 @@ def held_beyond(curve: OrbitCurve, spot: OrbitPoint, side: int) -> bool:
 
 def _end(tracer: OrbitTracer, name: str, zero: Zero) -> Node:
     """No orbit nearby beyond this point, or a continuum of them."""
-    itinerary = zero.spot.itinerary
+    itinerary = zero.point.itinerary
     row = zero.test.row
     slot = zero.test.slot if zero.test.kind == "guard" else int(itinerary.slot[row])
     switch = tracer.curve.model.switches[tracer.curve.model.slots[slot].switch].name
-    kind = "continuum" if held_beyond(tracer.curve, zero.spot, zero.side) else "end"
-    made = OrbitBifurcation.end(name, zero.spot, tracer.curve, (switch,), zero.side, kind)
-    return Node(zero.spot, int(tracer.curve.order), [], made)
+    kind = "continuum" if held_beyond(tracer.curve, zero.point, zero.side) else "end"
+    made = OrbitBifurcation.end(name, zero.point, tracer.curve, (switch,), zero.side, kind)
+    return Node(zero.point, int(tracer.curve.order), [], made)

@@ -11,9 +11,9 @@ import numpy as np
 from ....maps._corner_normal_form import CornerMap, Cycle
 from ....orbits.segments._equations import OrbitCurve
 from ....orbits.segments._itinerary import EventRecord, same_itinerary, Start, starts_from
+from ..._tracer import Trace
 from .._branch_switching import admissible, Departure, together, tracer_for, with_order
-from .._test_functions import PASSED
-from .._tracer import OrbitPoint, OrbitTracer, Trace, turned
+from .._tracer import OrbitPoint, OrbitTracer
 from ._grazing import exactly
 from ._return_map import Base, follow, frame
 
@@ -36,7 +36,7 @@ def half_of(
         found = _entered(own, spot, points, cycle._replace(points=cycle.points + away), distance)
         if found is None or not admissible(own.curve, found):
             continue
-        found = _beside(own, spot, found if float(found.look.tangent[-1]) * cycle.side >= 0 else turned(found))
+        found = _beside(own, spot, found if float(found.look.tangent[-1]) * cycle.side >= 0 else found.turned)
         if found is not None:
             return Departure(found, own.curve, cycle.laps, cycle.side, cycle)
     return None
@@ -68,23 +68,23 @@ def _beside(tracer: OrbitTracer, at: OrbitPoint, found: OrbitPoint) -> OrbitPoin
     """The orbit between a corner and whatever else there is on the way to it from an orbit, whose tangent should point
     away from the corner; None if the way does not come there."""
     short = dataclasses.replace(tracer, max_points=BACK)
-    for back in (turned(found), found):
+    for back in (found.turned, found):
         trace, passed = Trace((back,)), []  # at which points something else is
         while not trace.over:
             trace = short.further(trace)
-            if trace.at is not None and trace.at.test.kind in PASSED:
-                passed.append(len(trace.spots) - 1)
+            if trace.passed:
+                passed.append(len(trace.points) - 1)
         end = None if trace.end is None else exactly(tracer, trace.end)
-        if end is None or not together(end.spot, at, tracer.curve, NEIGHBOUR):
+        if end is None or not together(end.point, at, tracer.curve, NEIGHBOUR):
             continue
         if not passed:
-            return turned(back)
-        last, final = trace.spots[-2:]
-        if passed[-1] < len(trace.spots) - 2:
-            return turned(last)
+            return back.turned
+        last, final = trace.points[-2:]
+        if passed[-1] < len(trace.points) - 2:
+            return last.turned
         way = final.look.u - last.look.u
         between = tracer.orbit_near(found.itinerary, last.look.u + way / 2, way / np.linalg.norm(way))
-        return None if between is None else turned(between)
+        return None if between is None else between.turned
     return None
 
 

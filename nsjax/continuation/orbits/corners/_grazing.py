@@ -8,8 +8,9 @@ from ...._numerics._bracket import bracketed
 from ....orbits.segments._equations import guards_along, OrbitCurve
 from ....orbits.segments._itinerary import capacity_for, EVENT, GRAZING, OrbitItinerary, Start, TIME
 from ....system._impact import impact
+from ..._tracer import Zero
 from .._test_functions import Test
-from .._tracer import alike, OrbitPoint, OrbitTracer, Zero
+from .._tracer import alike, OrbitPoint, OrbitTracer
 
 
 TANGENTIAL = 0.1  # the rate of a guard, in units of the curve, below which a segment that vanishes may be a grazing
@@ -26,7 +27,7 @@ def exactly(tracer: OrbitTracer, zero: Zero) -> Zero | None:
 def landing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
     """Where a surface can only just hold what comes onto it: a corner at the event, like that of orbits that cross it
     there and can only just do so. None if the guard vanishes elsewhere."""
-    look, itinerary, slots = zero.spot.look, zero.spot.itinerary, tracer.curve.model.slots
+    look, itinerary, slots = zero.point.look, zero.point.itinerary, tracer.curve.model.slots
     i, n = zero.test.row, int(itinerary.num)
     before, after = slots[int(itinerary.slot[i - 1 if i else n - 1])], slots[zero.test.slot]
     comes = n > 1 and itinerary.ends[i - 1 if i else n - 1] == EVENT and not before.holding
@@ -38,7 +39,7 @@ def landing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
 def touching_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
     """Where segments beyond a surface vanish because orbits only graze it: both ends come to it tangentially, and the
     equations are singular. Those without these segments, but with cuts, are not. None if it is nothing like that."""
-    curve, look, c, n = tracer.curve, zero.spot.look, zero.spot.itinerary, int(zero.spot.itinerary.num)
+    curve, look, c, n = tracer.curve, zero.point.look, zero.point.itinerary, int(zero.point.itinerary.num)
     slots, length = curve.model.slots, np.asarray(look.end) - np.asarray(look.begin)
     size = np.asarray(curve.guard_sizes)[np.asarray(c.slot)] / float(curve.time) if slots else 1.0
     slow = np.abs(look.rates) < TANGENTIAL * size
@@ -67,20 +68,20 @@ def touching_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
     ends = np.array(itinerary.ends)
     ends[targets] = GRAZING
     start = Start(itinerary._replace(ends=ends), look.begin[kept], look.end[kept], look.x[kept])
-    at = tracer.orbit_near(start.itinerary, curve.pack(start, zero.spot.parameter))
+    at = tracer.orbit_near(start.itinerary, curve.pack(start, zero.point.parameter))
     found = None if at is None else _zero_along(tracer, at, targets[0])
-    if found is None or abs(found.parameter - zero.spot.parameter) > FOUND * float(curve.width):
+    if found is None or abs(found.parameter - zero.point.parameter) > FOUND * float(curve.width):
         return None
-    if not alike(found, zero.spot, curve, FOUND) or np.any(np.abs(found.look.ends[targets]) > 1e-9):
+    if not alike(found, zero.point, curve, FOUND) or np.any(np.abs(found.look.ends[targets]) > 1e-9):
         return None
     first, *others = (Test("duration", row) for row in targets)
-    return zero._replace(spot=found, test=first, others=tuple(others))
+    return zero._replace(point=found, test=first, others=tuple(others))
 
 
 def grazing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
     """The orbit at which the least value of a guard along a segment is zero: cut there, that is a smooth equation. Its
     tests are the segments that end with the cuts."""
-    spot = zero.spot
+    spot = zero.point
     least, where, n = spot.look.least, spot.look.where, int(spot.itinerary.num)
     # Least values are those of samples; what turns out not to vanish is left out again.
     near = np.maximum(0.05 * spot.look.most, 10 * abs(least[zero.test.row, zero.test.slot]))
@@ -95,7 +96,7 @@ def grazing_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
         values = np.abs(np.array([at.look.ends[r] for r in rows]))
         if np.all(values < 1e-9):
             first, *others = (Test("grazing", row) for row in rows)
-            return zero._replace(spot=at, test=first, others=tuple(others))
+            return zero._replace(point=at, test=first, others=tuple(others))
         kept = [pair for pair, v in zip(both, values) if v < 1e-9 or pair == both[0]]
         if len(kept) == len(both):
             return None
