@@ -72,9 +72,10 @@ def without_collection() -> Iterator[None]:
             gc.enable()
 
 
-def interactive(fn: F, often: bool = False) -> F:
+def interactive(fn: F, often: bool = False, host: bool = False) -> F:
     """`equinox.filter_jit` for what a user calls and waits for: compiled quickly, where it is not part of another
-    program; less so if it is called `often`."""
+    program; less so if it is called `often`. With `host` it returns NumPy's arrays: every operation that Python applies
+    to one of JAX's is compiled as a program of its own."""
     jit: Any = eqx.filter_jit
     within = jit(fn)
 
@@ -86,6 +87,7 @@ def interactive(fn: F, often: bool = False) -> F:
     def call(*args: Any, **kwargs: Any) -> Any:
         with without_collection():
             # The options can only be given to the outermost program.
-            return (alone() if outermost() else within)(*args, **kwargs)
+            found = (alone() if outermost() else within)(*args, **kwargs)
+        return jax.device_get(found) if host else found
 
     return cast(F, call)

@@ -1,15 +1,15 @@
 """The continuation of equilibria over a parameter, through folds and corners, along every branch."""
 
 import dataclasses
+import functools as ft
 import os
 from collections.abc import Sequence
 from typing import Any
 
 import jax
-import jax.flatten_util as jfu
-import jax.numpy as jnp
 import numpy as np
 
+from ..._numerics._compile import interactive
 from ..._numerics._text import shown
 from ..._types import Y
 from ...equilibria._equilibrium import Equilibrium
@@ -153,9 +153,9 @@ def _curve_and_starts(
     value = float(get_parameter(checked, path))
     check_interval("interval", (low, high), value, f"of `{parameter}` in `system`")
     model = SwitchedSystem.forwards(checked, t, y)
-    size = len(jfu.ravel_pytree(y)[0]) + len(model.holdable) + 1
-    mark = jnp.asarray((value - low) / (high - low), t.dtype)
-    curve = EquilibriumCurve(model, path, t, y, jnp.asarray(low, t.dtype), mark, jnp.ones(size, t.dtype))
+    size = sum(np.size(leaf) for leaf in jax.tree.leaves(y)) + len(model.holdable) + 1
+    mark = np.asarray((value - low) / (high - low))
+    curve = EquilibriumCurve(model, path, t, y, np.asarray(low), mark, np.ones(size))
     found = [one if isinstance(one, Equilibrium) else find_equilibrium(system, y, t=t) for one in starts]
     places = [_place(curve, one, value) for one in found]
     curve = dataclasses.replace(curve, units=_units(curve, places, high - low, scale))
@@ -166,31 +166,36 @@ def _place(curve: EquilibriumCurve, found: Equilibrium, value: float) -> tuple[A
     """The unknowns (in units of one), and the mode."""
     if not found.admissible:
         raise ValueError("Argument `start` must lead to an equilibrium, but what was found is virtual:\n" + str(found))
-    model, y = curve.model, jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), found.y, curve.like)
-    state = model.state_at(curve.t, y, tuple(found.mode))
-    part = [0 if p is None else int(p) for p in state.part]
-    mode = np.array([[int(m) for m in found.mode], part], np.int32).reshape(2, -1)
-    sigma = jnp.asarray([found.multipliers[k] for k in model.holdable], curve.t.dtype)
-    z = jnp.concatenate([jfu.ravel_pytree(y)[0], sigma, jnp.asarray([value - curve.low], curve.t.dtype)])
+    model, own = curve.model, np.asarray(found.mode)
+    y = jax.tree.map(lambda x, like: np.asarray(x, like.dtype), found.y, curve.like)
+    part = [0 if p is None else int(p) for p in _parts(model, curve.t, y, tuple(own))]
+    mode = np.array([own, part], np.int32).reshape(2, -1)
+    sigma = np.asarray(found.multipliers)[list(model.holdable)]
+    z = np.concatenate([*map(np.ravel, jax.tree.leaves(y)), sigma, [value - curve.low]])
     # At a kink the value of the switch is not determined: any side will do, as the others are looked at too.
     mode[0] = np.where(np.asarray(kinks(curve, z)) & (mode[0] == 0), 1, mode[0])
     return curve.entered(z, mode), mode
 
 
+@ft.partial(interactive, host=True)
+def _parts(model: SwitchedSystem, t: Any, y: Y, mode: tuple) -> tuple:
+    return model.state_at(t, y, mode).part
+
+
 def _units(curve: EquilibriumCurve, places: list[tuple[Any, np.ndarray]], width: float, scale: Y | None) -> Any:
     """The size of each unknown: what is given; or what it has, or how it varies; or, for want of both, one."""
     n = len(places[0][0]) - 1 - len(curve.model.holdable)
-    sigma = jnp.max(jnp.stack([jnp.abs(z[n:-1]) for z, _ in places]), axis=0)
+    sigma = np.max([np.abs(z[n:-1]) for z, _ in places], axis=0)
     if scale is not None:
-        own = jnp.asarray(checked_scale(curve.like, scale))
+        own = np.asarray(checked_scale(curve.like, scale))
     else:
         sizes = []
         for z, mode in places:
-            df = np.asarray(linearised(curve, z, jnp.asarray(mode))[1])
+            df = linearised(curve, z, mode)[1]
             rates = np.linalg.lstsq(df[:, :-1], -df[:, -1], rcond=1e-9)[0][:n]
-            x = np.abs(np.asarray(z[:n]))
+            x = np.abs(z[:n])
             sizes.append(np.maximum(x, np.minimum(np.abs(rates) * width, 1e3 * np.maximum(x, 1))))
         own = np.max(sizes, axis=0)
         largest = own.max() if own.max() > NOTHING else 1.0
-        own = jnp.asarray(np.where(own > max(1e-12 * largest, NOTHING), own, largest))
-    return jnp.concatenate([own, jnp.maximum(sigma, 1), jnp.asarray([width], own.dtype)])
+        own = np.where(own > max(1e-12 * largest, NOTHING), own, largest)
+    return np.concatenate([own, np.maximum(sigma, 1), [width]])

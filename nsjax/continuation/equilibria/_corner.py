@@ -3,15 +3,13 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-import jax.flatten_util as jfu
-import jax.numpy as jnp
 import numpy as np
 
 from ...setvalued._crossing import EigenvalueCrossing
 from ...setvalued._eigenvalue_crossings import eigenvalue_crossings
 from .._tracer import Zero
 from ._bifurcation import Bifurcation, classify, HalfBranch, kind_by_count, odd_one, unstable_number
-from ._corrector import branching, kept, linearised, near, row_sizes, Step, step_along
+from ._corrector import branching, kept, linearised, motion, near, row_sizes, Step, step_along
 from ._equations import EquilibriumCurve, first_lyapunov_coefficient, Record
 
 
@@ -71,8 +69,8 @@ class Node:
 
     def is_at(self, zero: Zero[EquilibriumPoint], curve: EquilibriumCurve) -> bool:
         here, there = curve.parts(self.u), curve.parts(zero.point.u)
-        x = jnp.abs(here[0] - there[0]) / curve.units[: len(here[0])]
-        return bool((jnp.max(x) < NEAR) & (jnp.abs(here[2] - there[2]) / curve.units[-1] < NEAR))
+        x = np.abs(here[0] - there[0]) / curve.units[: len(here[0])]
+        return bool((np.max(x) < NEAR) & (np.abs(here[2] - there[2]) / curve.units[-1] < NEAR))
 
 
 def active(curve: EquilibriumCurve, u: Any, mode: np.ndarray) -> np.ndarray:
@@ -82,8 +80,8 @@ def active(curve: EquilibriumCurve, u: Any, mode: np.ndarray) -> np.ndarray:
 
 def kernel(curve: EquilibriumCurve, u: Any, mode: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
     """The null space of DF, the left singular vector that belongs to it if it has two dimensions, and whether F = 0."""
-    f, df = (np.asarray(x) for x in linearised(curve, u, jnp.asarray(mode)))
-    rows = np.asarray(row_sizes(curve, u, jnp.asarray(mode)))
+    f, df = (np.asarray(x) for x in linearised(curve, u, mode))
+    rows = np.asarray(row_sizes(curve, u, mode))
     left, sizes, right = np.linalg.svd(df / rows[:, None])
     rank = int(np.sum(sizes > SINGULAR))
     return right[rank:], left[:, -1] / rows, bool(np.all(np.abs(f) <= 1e-7 * rows))
@@ -98,7 +96,7 @@ def directions(curve: EquilibriumCurve, u: Any, mode: np.ndarray) -> tuple[list[
         return [null[0], -null[0]], True
     if len(null) != 2:
         return [], False
-    form = np.asarray(branching(curve, u, jnp.asarray(null), jnp.asarray(left), jnp.asarray(mode)))
+    form = np.asarray(branching(curve, u, np.asarray(null), np.asarray(left), mode))
     values, axes = np.linalg.eigh((form + form.T) / 2)
     if not values[0] * values[1] < 0 or -values[0] * values[1] < 1e-12 * np.abs(values).max() ** 2:
         return [], False
@@ -117,8 +115,8 @@ def _half(
     matters = np.abs(signs) == 1
     if np.any(matters & (signs * here < -ACTIVE)):
         return None
-    mode_array, direction = jnp.asarray(mode), jnp.asarray(tangent)
-    step = step_along(curve, u, direction, jnp.asarray(length), mode_array)
+    mode_array, direction = mode, np.asarray(tangent)
+    step = step_along(curve, u, direction, np.asarray(length), mode_array)
     if not step.good:
         return None
     if abs(float(step.u[-1] - u[-1])) <= CONTINUUM and length < 1e-2:
@@ -132,7 +130,7 @@ def _half(
     move = float(step.u[-1] - u[-1])
     slopes = np.asarray(linearised(curve, step.u, mode_array)[1])[:, :-1]
     # Not the tangent itself: a field may have kinks that no switch tells of on this very surface.
-    secant = (step.u - u) / jnp.linalg.norm(step.u - u)
+    secant = (step.u - u) / np.linalg.norm(step.u - u)
     return Departure(
         u=u,
         tangent=secant,
@@ -262,7 +260,7 @@ def _described(
         by_crossing=by_crossing,
         parameter=name,
         value=float(curve.parts(u)[2]),
-        y=curve.at(u)[1],
+        y=curve.state_from(curve.parts(u)[0]),
         count=(sum(half.side < 0 for half in halves), sum(half.side > 0 for half in halves)),
         surfaces=surfaces,
         crossings=crossings,
@@ -288,7 +286,7 @@ def hopf_at(
 ) -> Bifurcation | None:
     """A point at which two eigenvalues cancel, or several pairs do; None for a neutral saddle, whose eigenvalues are
     real, and where none of them changes sides, as in a conservative system."""
-    record = kept(curve, u, jnp.asarray(mode))
+    record = kept(curve, u, mode)
     roots = np.asarray(record.eigenvalues)
     roots = roots[np.isfinite(roots)]
     sums = np.abs(roots[:, None] + roots) + np.diag(np.full(len(roots), np.inf))
@@ -305,7 +303,7 @@ def hopf_at(
     found = _described(curve, name, u, halves, None)
     # On a surface that holds the state the plane of the pair is not that of the coordinates.
     held = int(record.held) > 0
-    coefficient = 0.0 if held else float(first_lyapunov_coefficient(curve, u, jnp.asarray(mode)))
+    coefficient = 0.0 if held else float(first_lyapunov_coefficient(curve, u, mode))
     criticality = None if abs(coefficient) < 1e-9 else "supercritical" if coefficient < 0 else "subcritical"
     criticality = criticality if pairs == 1 else None
     by_crossing = ("Hopf",) * pairs
@@ -318,9 +316,9 @@ def start_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, tange
     """What a start is, if it is a fold or a Hopf point: where a branch sets out nothing changes its sign."""
     if abs(float(tangent[-1])) < 1e-9:
         return fold_at(curve, name, u, mode, tangent)
-    roots = kept(curve, u, jnp.asarray(mode)).eigenvalues
-    pairs = jnp.isfinite(roots.real) & (jnp.abs(roots.imag) > 0)
-    if bool(jnp.any(pairs & (jnp.abs(roots.real) <= 1e-9 * jnp.abs(roots)))):
+    roots = kept(curve, u, mode).eigenvalues
+    pairs = np.isfinite(roots.real) & (np.abs(roots.imag) > 0)
+    if bool(np.any(pairs & (np.abs(roots.real) <= 1e-9 * np.abs(roots)))):
         return hopf_at(curve, name, u, mode, tangent)
     return None
 
@@ -328,7 +326,7 @@ def start_at(curve: EquilibriumCurve, name: str, u: Any, mode: np.ndarray, tange
 def _public(curve: EquilibriumCurve, half: Departure) -> HalfBranch:
     move = np.asarray(half.tangent * curve.units)
     n = len(curve.parts(half.u)[0])
-    y = jfu.ravel_pytree(curve.like)[1](jnp.asarray(move[:n]))
+    y = curve.state_from(move[:n])
     record = half.step.record
     return HalfBranch(
         side=half.side,
@@ -351,10 +349,9 @@ def _crossed(
     curve: EquilibriumCurve, a: Departure, b: Departure
 ) -> tuple[tuple[str, ...], list[EigenvalueCrossing], list[dict[str, float]]]:
     """What the eigenvalues do on the way from one half-branch to the other, at the point itself."""
-    modes = jnp.asarray(a.mode), jnp.asarray(b.mode)
-    first, second = (np.asarray(curve.motion(half.u, mode)) for half, mode in zip((a, b), modes))
+    first, second = (motion(curve, half.u, half.mode) for half in (a, b))
     found = eigenvalue_crossings(first, second)
-    ends = [np.asarray(linearised(curve, half.u, mode)[1]) for half, mode in zip((a, b), modes)]
+    ends = [linearised(curve, half.u, half.mode)[1] for half in (a, b)]
     kinds, places = [], []
     names = [k.name for k in curve.model.switches]
     for crossing in found:

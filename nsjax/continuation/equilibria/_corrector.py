@@ -1,5 +1,6 @@
 """Curves of equilibria, N equations for N + 1 unknowns: the compiled parts of a pseudo-arclength continuation."""
 
+import functools as ft
 from typing import Any, NamedTuple
 
 import jax
@@ -88,7 +89,7 @@ def _corrected(curve: Curve, origin: Array, tangent: Array, s: Array, guess: Arr
     return find_root(residual, guess, None, Newton(TOLERANCE, 12))
 
 
-@interactive
+@ft.partial(interactive, host=True)
 def step_along(curve: Curve, u: Array, tangent: Array, s: Array, mode: Array) -> Step:
     """One step of length `s` along the curve."""
     end, good = _corrected(curve, u, tangent, s, u + s * tangent, mode)
@@ -108,7 +109,7 @@ class Place(NamedTuple):
     good: Bool[Array, ""]
 
 
-@interactive
+@ft.partial(interactive, host=True)
 def locate(
     curve: Curve,
     step: Step,
@@ -152,7 +153,7 @@ def locate(
     return Place(s, u, arriving, probe.values[which], good)
 
 
-@interactive
+@ft.partial(interactive, host=True)
 def on_surface(curve: Curve, u: Array, mode: Array, which: Array) -> Array:
     """The point of the curve, next to `u`, at which a guard vanishes."""
 
@@ -163,7 +164,7 @@ def on_surface(curve: Curve, u: Array, mode: Array, which: Array) -> Array:
     return jnp.where(good, found, u)
 
 
-@interactive
+@ft.partial(interactive, host=True)
 def branch_point(curve: Curve, u: Array, mode: Array) -> tuple[Array, Bool[Array, ""]]:
     """A simple branch point near `u`: with ψ the left null vector of DF, F + β ψ = 0, ψᵀ DF = 0, |ψ| = 1 are regular
     equations there, where F = 0 itself is not; Moore (1980)."""
@@ -178,13 +179,13 @@ def branch_point(curve: Curve, u: Array, mode: Array) -> tuple[Array, Bool[Array
     return u, good & (jnp.abs(beta) < 1e-9)
 
 
-@interactive
+@ft.partial(interactive, host=True)
 def linearised(curve: Curve, u: Array, mode: Array) -> tuple[Array, Array]:
     """F and DF."""
     return curve.residual(u, mode), jax.jacfwd(curve.residual)(u, mode)
 
 
-@interactive
+@ft.partial(interactive, host=True)
 def row_sizes(curve: Curve, u: Array, mode: Array) -> Array:
     """Of the rows of DF: what they have, or would have a unit further on, where all of a row vanishes here."""
     first = jax.jacfwd(curve.residual)
@@ -198,7 +199,7 @@ def row_sizes(curve: Curve, u: Array, mode: Array) -> Array:
     return jnp.where(size > 0, size, 1)
 
 
-@interactive
+@ft.partial(interactive, host=True)
 def branching(curve: Curve, u: Array, kernel: Float[Array, "2 n+1"], left: Array, mode: Array) -> Float[Array, "2 2"]:
     """ψᵀ D²F φ_i φ_j for the kernel φ_1, φ_2 of DF and ψ of its transpose: the branches through a simple branch point
     have the directions a φ_1 + b φ_2 on which this vanishes; Keller (1977)."""
@@ -210,5 +211,6 @@ def branching(curve: Curve, u: Array, kernel: Float[Array, "2 n+1"], left: Array
     return jnp.stack([jnp.stack(row) for row in jax.hessian(along, (0, 1))(zero, zero)])
 
 
-near = interactive(distances)
-kept = interactive(lambda curve, u, mode: curve.record(u, mode))
+near = interactive(distances, host=True)
+kept = interactive(lambda curve, u, mode: curve.record(u, mode), host=True)
+motion = interactive(lambda curve, u, mode: curve.motion(u, mode), host=True)

@@ -1,5 +1,6 @@
 """The curve on which the equilibria of a system lie when a parameter varies."""
 
+import functools as ft
 import itertools
 from typing import Any, NamedTuple
 
@@ -164,7 +165,7 @@ class EquilibriumCurve(eqx.Module):
             now = (int(mode[0, k]), int(mode[1, k]))
             if k not in touched:
                 back = now[0] == OFF and self.model.conditional(k) and self.model.contact[k] in touched
-                options.append([(int(self.side(u, k)), now[1])] if back else [now])
+                options.append([(int(_side(self, u, k)), now[1])] if back else [now])
                 continue
             if isinstance(switch, relay):
                 return [], [switch.name], False
@@ -182,22 +183,30 @@ class EquilibriumCurve(eqx.Module):
         modes = [np.array([self.model.present(tuple(mode[0])), mode[1]], np.int32) for mode in modes]
         return modes, [self.model.switches[k].name for k in touched], continuous
 
-    def side(self, u: Array, k: int) -> Array:
-        """The sign of h of a switch."""
-        model, y, _ = self.at(u)
-        return jnp.sign(model.least(k, self.t, y))
-
-    def entered(self, u: Array, mode: np.ndarray) -> Array:
+    def entered(self, u: np.ndarray, mode: np.ndarray) -> np.ndarray:
         """The same place, with the values which switches have in another mode."""
         n = len(u) - 1 - len(self.model.holdable)
         for i, k in enumerate(self.model.holdable):
             if not self.model.held(k, mode[0, k]):
                 value = float(self.model.switches[k].value(mode[0, k], float))
-                u = u.at[n + i].set(value / self.units[n + i])
+                u = np.where(np.arange(len(u)) == n + i, value / self.units[n + i], u)
         return u
 
+    def state_from(self, x: np.ndarray) -> Y:
+        """The state with these numbers, in Python."""
+        leaves, tree = jax.tree.flatten(self.like)
+        parts = np.split(x, np.cumsum([np.size(leaf) for leaf in leaves])[:-1])
+        return jax.tree.unflatten(tree, [part.reshape(np.shape(leaf)) for part, leaf in zip(parts, leaves)])
 
-@interactive
+
+@ft.partial(interactive, host=True)
+def _side(curve: EquilibriumCurve, u: Array, k: int) -> Array:
+    """The sign of h of a switch."""
+    model, y, _ = curve.at(u)
+    return jnp.sign(model.least(k, curve.t, y))
+
+
+@ft.partial(interactive, host=True)
 def kinks(curve: EquilibriumCurve, u: Array) -> Bool[Array, " switches"]:
     """Which switches the field does not feel at this point, nor on account of an error of its place: where h vanishes
     it is continuous there, with a kink."""
@@ -212,7 +221,7 @@ def kinks(curve: EquilibriumCurve, u: Array) -> Bool[Array, " switches"]:
     return jnp.all(jnp.abs(jumps) <= KINK * slopes, axis=0)
 
 
-@interactive
+@ft.partial(interactive, host=True)
 def first_lyapunov_coefficient(curve: EquilibriumCurve, u: Array, mode: Array) -> Float[Array, ""]:
     """Whether the periodic orbits at a Hopf point are stable (negative) in the plane of the pair, by derivatives up to
     the third of the field; Kuznetsov (2004), eq. (5.34)."""

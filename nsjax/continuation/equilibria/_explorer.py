@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from .._explorer import AbstractExplorer, Place, Tree
@@ -39,7 +38,7 @@ class EquilibriumExplorer(AbstractExplorer):
         x = self.tracer.curve.parts(u)[0]
         sizes = self.tracer.curve.units[: len(x)]
         others = (self.tracer.curve.parts(start[0])[0] for start in tree.waiting)
-        far = [not bool(jnp.max(jnp.abs(x - other) / sizes) < 1e-6) for other in others]
+        far = [not bool(np.max(np.abs(x - other) / sizes) < 1e-6) for other in others]
         return dataclasses.replace(tree, waiting=tuple(s for s, other in zip(tree.waiting, far) if other))
 
     def reason(self, tree: Tree) -> str:
@@ -64,7 +63,7 @@ class EquilibriumExplorer(AbstractExplorer):
         node, half, segment = tree.nodes[place[0]], tree.half(place), tree.segment
         first = not segment.points
         if first or node.bifurcation.discontinuous:
-            record = kept(self.tracer.curve, half.u, jnp.asarray(half.mode))
+            record = kept(self.tracer.curve, half.u, half.mode)
             if not half.regular:  # an eigenvalue is zero there, whose sign would be that of rounding
                 record = record._replace(eigenvalues=half.step.record.eigenvalues, stable=half.step.record.stable)
             segment = segment.then(EquilibriumPoint(half.u, half.tangent, half.mode, record))
@@ -86,8 +85,8 @@ class EquilibriumExplorer(AbstractExplorer):
         tree = self.without_start(dataclasses.replace(tree, waiting=tree.waiting[1:]), u)
         tangents, regular = directions(curve, u, mode)
         # Upwards first. (At a node tangents may be missing, and are not needed.)
-        tangent = jnp.asarray(max(tangents, key=lambda d: d[-1], default=jnp.zeros_like(u)))
-        point = EquilibriumPoint(u, tangent, mode, kept(curve, u, jnp.asarray(mode)))
+        tangent = np.asarray(max(tangents, key=lambda d: d[-1], default=np.zeros_like(u)))
+        point = EquilibriumPoint(u, tangent, mode, kept(curve, u, mode))
         if np.any(active(curve, u, mode)) or not regular:
             if not any(node.is_at(Zero(0.0, None, point), curve) for node in tree.nodes):
                 tree = dataclasses.replace(tree, nodes=(*tree.nodes, node_at(curve, self.name, u, mode)))

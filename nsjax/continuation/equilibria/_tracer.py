@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from .._tracer import AbstractTracer, Zero
@@ -30,7 +29,7 @@ class EquilibriumTracer(AbstractTracer[EquilibriumPoint]):
     aim = 0.1
 
     def at(self, point: EquilibriumPoint, s: float) -> EquilibriumPoint | None:
-        step = step_along(self.curve, point.u, point.tangent, jnp.asarray(s), jnp.asarray(point.mode))
+        step = step_along(self.curve, point.u, point.tangent, np.asarray(s), point.mode)
         return EquilibriumPoint(step.u, step.tangent, point.mode, step.record, step) if step.good else None
 
     def zeros(
@@ -48,7 +47,7 @@ class EquilibriumTracer(AbstractTracer[EquilibriumPoint]):
 
     def closes(self, begin: EquilibriumPoint, before: EquilibriumPoint, after: EquilibriumPoint, length: float) -> bool:
         start, tangent, u, end = begin.u, begin.tangent, before.u, after.u
-        near = jnp.linalg.norm(end - start) < 2 * jnp.linalg.norm(end - u)
+        near = np.linalg.norm(end - start) < 2 * np.linalg.norm(end - u)
         there = near & (tangent @ (u - start) < 0) & (tangent @ (end - start) >= 0)
         return np.array_equal(after.mode, begin.mode) and bool(there)
 
@@ -76,20 +75,20 @@ class EquilibriumTracer(AbstractTracer[EquilibriumPoint]):
         self, here: EquilibriumPoint, before: EquilibriumPoint, last: EquilibriumPoint
     ) -> EquilibriumPoint:
         """Improved; an eigenvalue is zero there, whose sign would be that of rounding."""
-        u, good = branch_point(self.curve, here.u, jnp.asarray(here.mode))
-        found = self.point_at(u if good and float(jnp.max(jnp.abs(u - here.u))) < 1e-5 else here.u, here)
+        u, good = branch_point(self.curve, here.u, here.mode)
+        found = self.point_at(u if good and float(np.max(np.abs(u - here.u))) < 1e-5 else here.u, here)
         record = found.record._replace(eigenvalues=last.record.eigenvalues, stable=last.record.stable)
         return found._replace(tangent=before.tangent, record=record)
 
     def point_at(self, u: Any, like: EquilibriumPoint) -> EquilibriumPoint:
-        return like._replace(u=u, record=kept(self.curve, u, jnp.asarray(like.mode)))
+        return like._replace(u=u, record=kept(self.curve, u, like.mode))
 
     def dead_end(self, point: EquilibriumPoint) -> Zero | None:
         """Where there is no way past a surface with this side's equations, one ends on it."""
         on = np.flatnonzero(active(self.curve, point.u, point.mode))
         if not len(on):
             return None
-        u = on_surface(self.curve, point.u, jnp.asarray(point.mode), jnp.asarray(on[0]))
+        u = on_surface(self.curve, point.u, point.mode, np.asarray(on[0]))
         return Zero(0.0, GUARDS + int(on[0]), self.point_at(u, point))
 
     def changed(self, before: Record, after: Record) -> bool:
@@ -110,8 +109,8 @@ class EquilibriumTracer(AbstractTracer[EquilibriumPoint]):
         found: list[Zero] = []
 
         def located(ends: tuple[float, float], which: int, slope: bool = False) -> tuple[Zero, float]:
-            number, flag = jnp.asarray(which), jnp.asarray(slope)
-            place = locate(self.curve, step, u, tangent, jnp.asarray(ends), jnp.asarray(mode), number, slope=flag)
+            number, flag = np.asarray(which), np.asarray(slope)
+            place = locate(self.curve, step, u, tangent, np.asarray(ends), mode, number, slope=flag)
             point = EquilibriumPoint(place.u, place.tangent, mode, before.record)
             return Zero(float(place.s), which, point, marks=which == MARK), float(place.value)
 
