@@ -258,6 +258,7 @@ class Ball(nsjax.System):
         return 2 * jnp.pi / self.omega
 
 
+@pytest.mark.slow
 def test_interval_begins_at_a_corner():
     """The branch ends there: what lies beyond the corner is outside."""
     known = BumperReference(1.14, 0.3)

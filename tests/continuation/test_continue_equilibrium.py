@@ -78,6 +78,14 @@ CASES = {
 }
 
 
+# Of these every run of the tests makes sure, of the others the slow ones (and the notebook on equilibria).
+QUICK = ("(5.11)", "(5.17), α = -1", "(5.18)", "(5.25)", "(5.29)", "(5.32)")
+
+
+def marked(names):
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in names]
+
+
 @pytest.fixture(scope="module")
 def found():
     """Each continued once."""
@@ -92,7 +100,7 @@ def found():
     return branch
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", marked(CASES))
 def test_chapter_5(name, found):
     """Kind, criticality, whether it is discontinuous, counts, values and critical q, as the thesis has them."""
     expected = CASES[name][2]
@@ -146,21 +154,21 @@ def exact(name, value):
     }[name]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "(5.7)",
-        "(5.8)",
-        "(5.10)",
-        "(5.11)",
-        "(5.17), α = -1",
-        "(5.17), α = 1",
-        "(5.18)",
-        "(5.22)",
-        "(5.32)",
-        "no crossing",
-    ],
+CLOSED = (
+    "(5.7)",
+    "(5.8)",
+    "(5.10)",
+    "(5.11)",
+    "(5.17), α = -1",
+    "(5.17), α = 1",
+    "(5.18)",
+    "(5.22)",
+    "(5.32)",
+    "no crossing",
 )
+
+
+@pytest.mark.parametrize("name", marked(CLOSED))
 def test_every_branch_is_followed(name, found):
     """Each point is an equilibrium of the closed form, with its eigenvalue; and none of these is missing anywhere."""
     branches = found(name).branches
@@ -182,13 +190,14 @@ def test_every_branch_is_followed(name, found):
         np.testing.assert_allclose(sorted(seen), sorted(np.real([y for y, _ in exact(name, value)])), atol=1e-3)
 
 
-def test_stability_changes_at_special_points_only(found):
-    for name in CASES:
-        for branch in found(name).branches:
-            changes = set(np.flatnonzero(np.diff(branch.unstable) != 0))
-            assert all(any(i in (j - 1, j) for j in branch.indices) for i in changes), name
+@pytest.mark.parametrize("name", marked(CASES))
+def test_stability_changes_at_special_points_only(name, found):
+    for branch in found(name).branches:
+        changes = set(np.flatnonzero(np.diff(branch.unstable) != 0))
+        assert all(any(i in (j - 1, j) for j in branch.indices) for i in changes)
 
 
+@pytest.mark.slow
 def test_branches_without_connection():
     """(5.15): two branches, no bifurcation; (5.23): the lower two are born in a saddle-node: x and μ by mpmath."""
     import mpmath as mp
@@ -226,6 +235,7 @@ class Cubic(nsjax.System):
         return Line(self.mu + self.a * y.x - y.x**3)
 
 
+@pytest.mark.slow
 def test_hysteresis_point():
     """Fig. 5.1: vertical, and no bifurcation; unfolded, two folds at μ = ±2/(3 √3)."""
     branch = continue_equilibrium(Cubic(), Line(-1.0), "mu", (-1.0, 1.0))
@@ -268,8 +278,8 @@ def test_closed_branch():
         (gallery.Pitchfork(0.0), Line(0.0), ["pitchfork"]),
         (gallery.SaddleNode(0.0), Line(0.0), ["saddle-node"]),
         (gallery.Hopf(0.0), Plane(0.0, 0.0), ["Hopf"]),
-        (gallery.DiscontinuousPitchfork(1.0), Line(0.9), ["pitchfork"]),
-        (gallery.HopfPitchfork(1.0), Plane(2.1, 0.1), ["Hopf-pitchfork"]),
+        pytest.param(gallery.DiscontinuousPitchfork(1.0), Line(0.9), ["pitchfork"], marks=pytest.mark.slow),
+        pytest.param(gallery.HopfPitchfork(1.0), Plane(2.1, 0.1), ["Hopf-pitchfork"], marks=pytest.mark.slow),
     ],
 )
 def test_from_other_starts(system, start, kinds):
@@ -332,6 +342,7 @@ class Singular(nsjax.System):
         return y.x
 
 
+@pytest.mark.slow
 def test_singular_one_sided_jacobian():
     """c = 0: at μ = 0 every x < 0 is an equilibrium, for μ < 0 none. c = 1: the branch x = -√μ sets out vertically."""
     branch = continue_equilibrium(Singular(), Line(1.0), "mu", (-1.0, 1.0))
@@ -417,6 +428,7 @@ class Thermostat(nsjax.System):
         return y.x - 2.0
 
 
+@pytest.mark.slow
 def test_relay_ends_a_branch():
     """Below T_0 = 1 the heater switches on: this equilibrium is gone."""
     branch = continue_equilibrium(Thermostat(), Line(1.5), "T_0", (0.0, 3.0))
@@ -520,6 +532,7 @@ class Lorenz(nsjax.System):
         return jnp.stack([10 * (y[1] - y[0]), y[0] * (self.rho - y[2]) - y[1], y[0] * y[1] - 8 / 3 * y[2]])
 
 
+@pytest.mark.slow
 def test_lorenz():
     """A pitchfork at ρ = 1, and subcritical Hopf bifurcations at ρ = σ (σ + β + 3)/(σ - β - 1) = 470/19."""
     branch = continue_equilibrium(Lorenz(), jnp.zeros(3), "rho", (0.0, 30.0))
@@ -537,6 +550,7 @@ class Pendulum(nsjax.System):
         return Motion(y.v, self.mu * y.x - y.x**3)
 
 
+@pytest.mark.slow
 def test_conservative_system():
     """Its eigenvalues stay on the axis: that is no Hopf bifurcation, wherever one begins."""
     for mu in (-1.0, -0.7):
@@ -558,6 +572,7 @@ class Belt(nsjax.System):
         return y.v - self.v_dr
 
 
+@pytest.mark.slow
 def test_unmarked_kink_beside_a_switch():
     """Hopf where 1/(1 + v_dr)² = 0.1. Below v_dr = 0 there is no way on: at rest all |x| <= 1 are equilibria."""
     branch = continue_equilibrium(Belt(), Motion(0.2, 0.0), "v_dr", (-1.0, 5.0))
@@ -585,7 +600,7 @@ class Two(nsjax.System):
         return y.x - self.d
 
 
-@pytest.mark.parametrize("d", [1e-3, 1e-5, 1e-7])
+@pytest.mark.parametrize("d", [pytest.param(1e-3, marks=pytest.mark.slow), 1e-5, 1e-7])
 def test_corners_next_to_each_other(d):
     branch = continue_equilibrium(Two(d=d), Line(-1.0), "mu", (-1.0, 1.0))
     assert [b.kind for b in branch.bifurcations] == ["saddle-node"] * 2

@@ -63,6 +63,7 @@ def test_infinitely_unstable_fold(stick_slip):
     assert "infinitely unstable fold" in str(stick_slip)
 
 
+@pytest.mark.slow
 def test_infinitely_unstable_orbits(stick_slip):
     """The amplitude of the unstable orbit at v_dr = 0.5, found backwards by shooting."""
     system = gallery.StickSlip(c=0.1, v_dr=0.5)
@@ -296,7 +297,9 @@ def test_the_wall_that_is_hit():
     assert list(branch.values[[0, -1]]) == pytest.approx([0.8, 1.2]) and not branch.special_points
 
 
-@pytest.mark.parametrize("alpha, criticality", [(-1.0, "supercritical"), (1.0, "subcritical")])
+@pytest.mark.parametrize(
+    "alpha, criticality", [(-1.0, "supercritical"), pytest.param(1.0, "subcritical", marks=pytest.mark.slow)]
+)
 def test_a_branch_shrinks_to_a_hopf_point(alpha, criticality):
     """(5.25): r = √(-μ/α), period 2π/(ω + β r²). The parameter is even in the size, but the orbits do not turn back."""
     system = gallery.Hopf(mu=-0.8 * alpha, alpha=alpha)
