@@ -33,6 +33,7 @@ def in_lanes(fn: Callable[..., Any], chunk: int, *args: Any) -> Any:
         return jax.tree.leaves(fn(*jax.tree.unflatten(tree, xs)))
 
     shapes = tuple((o.shape[:-1], o.dtype) for o in jax.tree.leaves(form))
+    flat = [jnp.asarray(x) for x in flat]
     results = in_lanes_p.bind(*flat, fn=listed, shapes=shapes, own=(len(flat), len(shapes)), chunk=chunk)
     return jax.tree.unflatten(jax.tree.structure(form), results)
 
@@ -68,7 +69,7 @@ def _batch(args: Any, dims: Any, *, fn: Flat, shapes: Any, own: Any, chunk: int)
     size = next(x.shape[d] for x, d in zip(args, dims) if d is not None)
     batched = [d is not None for d in dims]
     if any(batched[: own[0]]):
-        last = [jnp.moveaxis(spread(x, size) if d is None else x, 0 if d is None else d, -1) for x, d in zip(args, dims)]
+        last = [jnp.moveaxis(spread(jnp.asarray(x), size) if d is None else x, 0 if d is None else d, -1) for x, d in zip(args, dims)]
         results = _chunked(fn, chunk, last)
         return results, [x.ndim - 1 for x in results]
     # A batch of tangents alone (`jacfwd`) is none of lanes: what is differentiated stays as it is.
