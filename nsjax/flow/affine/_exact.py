@@ -1,7 +1,6 @@
 """The loop of the exact flow: arcs of all lanes, as long as they are plain; then a turn of the general flow for those
 lanes that wait for it."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -12,13 +11,12 @@ from jaxtyping import Array
 
 from ..._numerics._lane_cond import compact_cond
 from ..._numerics._lanes import in_lanes
-from ..._types import Y
 from ...system._mode import ModeState
 from .._loop import Carry, Flow
-from ._lane import entered, found_in, Lane, left, Lanes, MISSING
+from ._lane import entered, Lane, Lanes, left, MISSING
 from ._plan import constants, made, numbers, Plan, Problem
 from ._table import by_lane, DEGREE, key_of, PHASE, Table, tabulate, THETA
-from ._turn import MOST_ARCS, picked, saves, turn
+from ._turn import many, picked, saves, turn
 
 
 _KEPT = 3  # tables a lane, at most
@@ -118,8 +116,8 @@ def _general(problem: Problem, table: Table, carry: Carry, lane: Lane) -> tuple[
 
     def go(args: tuple) -> tuple:
         carry, lane = args
-        length = 0.3 * picked(table.length, lane.index)
-        before = left(problem, lane, carry, length)
+        length = picked(table.length, lane.index)
+        before = left(problem, lane, carry, jnp.where(many(flow, length), carry.dt, 0.3 * length))
         after = by_lane(_one_turn, flow, waits, before)
         return after, back(after, lane)
 
@@ -146,5 +144,3 @@ def _one_turn(flow: Flow, wanted: Array, carry: Carry) -> Carry:
 
     return eqx.combine(compact_cond(wanted, branch, (moving, dynamic), dynamic), static)
 
-
-_ = dataclasses, Y, found_in, MOST_ARCS

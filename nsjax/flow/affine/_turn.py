@@ -135,6 +135,8 @@ def turn(problem: Problem, table: Table, lane: Lane) -> Lane:
         met = Meeting(frozen(t), there.z, rows, [*arc.fires], there.rate, guards, lane.modes)
         after = plain(flow, plan, constants, met)
         sure = sure & (~arc.event | after.sure)
+    # Of a stiff mode an arc is as short as what decays fast is, whether that is still there or not.
+    sure = sure & ~(many(flow, arc.length) & (lane.wait > 3 * arc.length))
     # The general flow has the last word on limits.
     sure = sure & (lane.steps + 1 < flow.max_steps)
     if flow.model.slots:
@@ -149,6 +151,11 @@ def turn(problem: Problem, table: Table, lane: Lane) -> Lane:
         new = new._replace(saved=_saved(problem, lane, arc, end, new))
     active = lane.active & ~(moved & (new.t >= flow.t1))
     return new._replace(active=active, slow=lane.slow | (live & ~sure))
+
+
+def many(flow: Flow, length: Lanes) -> Truths:
+    """Whether all the time would take very many arcs of that length."""
+    return MOST_ARCS * length < frozen(flow.t1 - flow.t0)
 
 
 class End(NamedTuple):
