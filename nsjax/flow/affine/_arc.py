@@ -83,7 +83,7 @@ def _looped(rows: list[Rows], z: Rows, h: Lanes, parts: int) -> tuple[Rows, list
 
 
 @jax.custom_jvp
-def arrived(z: Array, matrix: Array, guard: Array, meets: Array) -> tuple[Lanes, Array]:
+def arrived(z: Rows, rows: list[Rows], guard: Rows, meets: Array) -> tuple[Lanes, Rows]:
     """The time (zero) from z to the surface guard · z = 0 on which it is, and z there without its last component: their
     derivatives are those of a solution of z' = X z that ends on the surface, where it `meets` one.
 
@@ -95,12 +95,11 @@ def arrived(z: Array, matrix: Array, guard: Array, meets: Array) -> tuple[Lanes,
 
 @arrived.defjvp
 def _arrived_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    z, matrix, guard, meets = primals
+    z, rows, guard, meets = primals
     dz, _, dguard, _ = tangents
-    shift, x = arrived(z, matrix, guard, meets)
-    there = jnp.concatenate([x, z[-1:]])
-    f = jnp.sum(matrix * there, axis=1)
-    slope = jnp.sum(guard[:-1] * f, axis=0)
-    change = jnp.sum(guard * dz + dguard * there, axis=0)
+    shift, x = arrived(z, rows, guard, meets)
+    there = [*x, z[-1]]
+    f = [full(dot(row, there), shift) for row in rows]
+    slope, change = dot(guard[:-1], f), dot(guard, dz) + dot(dguard, there)
     moved = jnp.where(meets, -change / jnp.where(meets, slope, 1), 0)
-    return (shift, x), (moved, dz[:-1] + f * moved)
+    return (shift, x), (moved, [d + a * moved for d, a in zip(dz, f)])

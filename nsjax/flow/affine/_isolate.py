@@ -14,7 +14,7 @@ from ..._numerics._bernstein import binomials
 
 DEPTH = 24  # halvings of an arc; what they do not separate is left to the general flow
 NEAR = 1e-4  # how near to zero a guard may come without an event, as a part of its size on the arc
-_HALLEY = 3
+_HALLEY = 2
 
 Lanes = Float[Array, " lanes"]
 Truths = Bool[Array, " lanes"]
@@ -129,7 +129,7 @@ def root(
         new = u - newton / jnp.where(jnp.abs(ratio) < 0.5, 1 - ratio, 1)
         before, u = u, once(jnp.clip(new, low, low + 0.125))
     # The few that have not converged: by bisection.
-    poor = wanted & ~(jnp.abs(u - before) < 1e-4)
+    poor = wanted & ~(jnp.abs(u - before) < 1e-3)
 
     def bisect(carry: tuple) -> tuple:
         count, low, high = carry

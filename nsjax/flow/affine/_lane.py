@@ -155,7 +155,8 @@ def logged(log: Log, index: Numbers, when: Truths, row: tuple[Any, ...]) -> Log:
         place = jnp.where(when, index, buffer.shape[0])
         if buffer.ndim == 2:
             return buffer.at[place, lanes].set(value, mode="drop")
-        flat, values = buffer.reshape(buffer.shape[0], -1, buffer.shape[-1]), value.reshape(-1, value.shape[-1])
+        values = value.reshape(-1, value.shape[-1])
+        flat = buffer.reshape(buffer.shape[0], *values.shape)
         for j, x in enumerate(values):
             flat = flat.at[place, j, lanes].set(x, mode="drop")
         return flat.reshape(buffer.shape)

@@ -107,7 +107,7 @@ def go(plan: Plan, rows: list[Rows], guards: list[Rows], projection: Any, z: Row
     normal, speed = sum(x * x for x in w0[: plan.size]), sum(x * x for x in f0[: plan.size])
     cosine = jnp.abs(rate) / jnp.sqrt((normal + drift**2) * (speed + jnp.where(drift == 0, 0, 1)))
     clear = (rate < -1e2 * small(like) * size) & (cosine > 1e2 * small(like))
-    delay, moved = arrived(jnp.stack(z), jnp.stack([jnp.stack([full(a, like) for a in row]) for row in rows]), jnp.stack(w), event)
+    delay, moved = arrived(z, rows, w, event)
     z = [*[once(x) for x in moved], z[-1]]
     return There(z, shift + delay, rate, ~event | (close & clear), cosine, terms)
 
