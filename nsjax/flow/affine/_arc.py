@@ -8,7 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..._numerics._barrier import once
+from ..._numerics._barrier import stored
 from ._plan import Plan
 
 
@@ -34,7 +34,7 @@ def full(x: Any, like: Lanes) -> Lanes:
 def matrix_rows(plan: Plan, matrix: Float[Array, "n m lanes"], squared: Lanes) -> list[Rows]:
     """The rows of z' = X z, but for the last, which is zero."""
     rows: list[Rows] = [
-        [once(x) if there else None for x, there in zip(row, pattern)] for row, pattern in zip(matrix, plan.pattern)
+        [stored(x) if there else None for x, there in zip(row, pattern)] for row, pattern in zip(matrix, plan.pattern)
     ]
     if plan.timed:  # S' = 1 - ω² C, C' = S
         one, none = jnp.ones_like(squared), [None] * plan.size
@@ -57,7 +57,7 @@ def series(rows: list[Rows], z: Rows, tau: Lanes, theta: float) -> tuple[Rows, l
             term = [None if x is None else x * (1 / j) for x in (dot(row, term) for row in scaled)]
             terms.append([*term, None])
             total = [x if w is None else x + w for x, w in zip(total, term)]
-        z = [*[once(x) for x in total], z[-1]]
+        z = [*[stored(x) for x in total], z[-1]]
     return z, terms
 
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Y
@@ -147,19 +148,31 @@ def left(problem: Problem, lane: Lane, c: Carry, dt: Lanes) -> Carry:
     )
 
 
+@jax.custom_jvp
+def _put(buffer: Float[Array, "rows lanes"], place: Numbers, value: Lanes) -> Float[Array, "rows lanes"]:
+    """A number into a row of each lane. (Its derivative is the same; JAX does not know that no two go to one place.)"""
+    lanes = jnp.arange(place.shape[0], dtype=jnp.int32)
+    return buffer.at[place, lanes].set(value, mode="drop")
+
+
+@_put.defjvp
+def _put_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    (buffer, place, value), (dbuffer, _, dvalue) = primals, tangents
+    out = _put(buffer, place, value)
+    smooth = jnp.issubdtype(out.dtype, jnp.inexact)
+    return out, _put(dbuffer, place, dvalue) if smooth else np.zeros(out.shape, jax.dtypes.float0)
+
+
 def logged(log: Log, index: Numbers, when: Truths, row: tuple[Any, ...]) -> Log:
     """`Log.write` for all lanes."""
-    lanes = jnp.arange(index.shape[0], dtype=jnp.int32)
 
     def put(buffer: Array, value: Array) -> Array:
         place = jnp.where(when, index, buffer.shape[0])
         if buffer.ndim == 2:
-            return buffer.at[place, lanes].set(value, mode="drop")
+            return _put(buffer, place, value)
         values = value.reshape(-1, value.shape[-1])
         flat = buffer.reshape(buffer.shape[0], *values.shape)
-        for j, x in enumerate(values):
-            flat = flat.at[place, j, lanes].set(x, mode="drop")
-        return flat.reshape(buffer.shape)
+        return jnp.stack([_put(flat[:, j], place, x) for j, x in enumerate(values)], axis=1).reshape(buffer.shape)
 
     def columns(log: Log) -> tuple:
         return log.t, log.before, log.after, log.slot, log.modes, log.transversality

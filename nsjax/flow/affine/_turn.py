@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._numerics._autodiff import frozen
-from ..._numerics._barrier import once
+from ..._numerics._barrier import once, stored
 from ..._numerics._bernstein import binomials
 from .._loop import Flow
 from .._save import Log, Saved
@@ -91,14 +91,14 @@ def go(plan: Plan, rows: list[Rows], guards: list[Rows], projection: Any, z: Row
     nought = jnp.zeros_like(like)
     if not guards:
         return There(z, nought, nought, ~arc.doubtful, nought, terms)
-    w = [once(sum(jnp.where(arc.fires[r], full(row[q], like), 0) for r, row in enumerate(guards))) for q in range(len(z))]
+    w = [stored(sum(jnp.where(arc.fires[r], full(row[q], like), 0) for r, row in enumerate(guards))) for q in range(len(z))]
     f = [full(dot(row, z), like) for row in rows]
     bend = [full(dot(row, [*f, None]), like) for row in rows]
     value, rate = frozen((dot(w, z), dot(w[:-1], f)))
     shift = jnp.where(event, -value / jnp.where(rate == 0, 1, rate), 0)
-    z = [*[once(x + shift * (a + 0.5 * shift * b)) for x, a, b in zip(z, f, bend)], z[-1]]
+    z = [*[stored(x + shift * (a + 0.5 * shift * b)) for x, a, b in zip(z, f, bend)], z[-1]]
     if projection is not None:
-        z = [*[once(dot(row, z)) for row in projection], *z[plan.size :]]
+        z = [*[stored(dot(row, z)) for row in projection], *z[plan.size :]]
     # Of steps of Newton's method that small the error is below rounding.
     close = jnp.abs(shift) <= float(jnp.finfo(like.dtype).eps) ** (1 / 3) * 0.2 * arc.length
     w0, f0 = frozen((w, f))
@@ -108,7 +108,7 @@ def go(plan: Plan, rows: list[Rows], guards: list[Rows], projection: Any, z: Row
     cosine = jnp.abs(rate) / jnp.sqrt((normal + drift**2) * (speed + jnp.where(drift == 0, 0, 1)))
     clear = (rate < -1e2 * small(like) * size) & (cosine > 1e2 * small(like))
     delay, moved = arrived(z, rows, w, event)
-    z = [*[once(x) for x in moved], z[-1]]
+    z = [*[stored(x) for x in moved], z[-1]]
     return There(z, shift + delay, rate, ~event | (close & clear), cosine, terms)
 
 
@@ -120,7 +120,7 @@ def turn(problem: Problem, table: Table, lane: Lane) -> Lane:
     n, m = plan.size, plan.width
     matrix = [[picked(table.matrix[:, i, j], lane.index) for j in range(m)] for i in range(n)]
     rows = matrix_rows(plan, matrix, constants.frequency)
-    guards = [[once(picked(table.guards[:, r, q], lane.index)) for q in range(m)] for r in range(len(plan.rows))]
+    guards = [[stored(picked(table.guards[:, r, q], lane.index)) for q in range(m)] for r in range(len(plan.rows))]
     projection = table.projection
     if projection is not None:
         projection = [[picked(projection[:, i, j], lane.index) for j in range(m)] for i in range(n)]
