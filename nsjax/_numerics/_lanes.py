@@ -19,6 +19,9 @@ from jax.interpreters import ad, batching, mlir
 from ._inner import Flat, mapped, moving, pushed_forward, spread, with_zeros
 
 
+Levels = tuple[tuple[int, int], ...]
+"""How many arguments and results there are: of the function itself, with its first tangents, and so on."""
+
 in_lanes_p = jex.Primitive("in_lanes")
 in_lanes_p.multiple_results = True
 
@@ -34,7 +37,7 @@ def in_lanes(fn: Callable[..., Any], chunk: int, *args: Any) -> Any:
 
     shapes = tuple((o.shape[:-1], o.dtype) for o in jax.tree.leaves(form))
     flat = [jnp.asarray(x) for x in flat]
-    results = in_lanes_p.bind(*flat, fn=listed, shapes=shapes, own=(len(flat), len(shapes)), chunk=chunk)
+    results = in_lanes_p.bind(*flat, fn=listed, shapes=shapes, levels=((len(flat), len(shapes)),), chunk=chunk)
     return jax.tree.unflatten(jax.tree.structure(form), results)
 
 
@@ -42,7 +45,7 @@ def _one(x: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct((*jnp.shape(x), 1), jnp.result_type(x))
 
 
-def _impl(*args: Any, fn: Flat, shapes: Any, own: Any, chunk: int) -> list[Any]:
+def _impl(*args: Any, fn: Flat, shapes: Any, levels: Levels, chunk: int) -> list[Any]:
     return [x[..., 0] for x in fn(*[jnp.asarray(x)[..., None] for x in args])]
 
 
@@ -65,35 +68,37 @@ def _chunked(fn: Flat, chunk: int, args: list[Any]) -> list[Any]:
     return [join(x) for x in lax.map(lambda xs: fn(*xs), [split(x) for x in args])]
 
 
-def _batch(args: Any, dims: Any, *, fn: Flat, shapes: Any, own: Any, chunk: int) -> tuple[list[Any], list[int | None]]:
+def _batch(args: Any, dims: Any, *, fn: Flat, shapes: Any, levels: Levels, chunk: int) -> tuple[list[Any], list[int | None]]:
     size = next(x.shape[d] for x, d in zip(args, dims) if d is not None)
     batched = [d is not None for d in dims]
-    if any(batched[: own[0]]):
+    if any(batched[: levels[0][0]]):
         last = [jnp.moveaxis(spread(jnp.asarray(x), size) if d is None else x, 0 if d is None else d, -1) for x, d in zip(args, dims)]
         results = _chunked(fn, chunk, last)
         return results, [x.ndim - 1 for x in results]
     # A batch of tangents alone (`jacfwd`) is none of lanes: what is differentiated stays as it is.
     front = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims)]
-    wide = [i >= own[1] for i in range(len(shapes))]
+    count = next(outs for (_, outs), (inputs, _) in zip(levels, levels[1:]) if any(batched[:inputs]))
+    wide = [i >= count for i in range(len(shapes))]
     new = tuple(((size, *s) if w else s, d) for (s, d), w in zip(shapes, wide))
-    results = in_lanes_p.bind(*front, fn=mapped(fn, size, batched, wide), shapes=new, own=own, chunk=chunk)
+    results = in_lanes_p.bind(*front, fn=mapped(fn, size, batched, wide), shapes=new, levels=levels, chunk=chunk)
     return results, [0 if w else None for w in wide]
 
 
 def _jvp(
-    primals: Any, tangents: Any, *, fn: Flat, shapes: Any, own: Any, chunk: int
+    primals: Any, tangents: Any, *, fn: Flat, shapes: Any, levels: Levels, chunk: int
 ) -> tuple[list[Any], list[Any]]:
     smooth = moving(tangents)
     kept = [i for i, (_, dtype) in enumerate(shapes) if jnp.issubdtype(dtype, jnp.inexact)]
     both = pushed_forward(fn, len(primals), smooth, kept)
     moves = [tangents[i] for i in smooth]
     wider = (*shapes, *[shapes[i] for i in kept])
-    results = in_lanes_p.bind(*primals, *moves, fn=both, shapes=wider, own=own, chunk=chunk)
+    levels = (*levels, (len(primals) + len(moves), len(wider)))
+    results = in_lanes_p.bind(*primals, *moves, fn=both, shapes=wider, levels=levels, chunk=chunk)
     count = len(shapes)
     return results[:count], with_zeros(results[:count], kept, results[count:])
 
 
-def _shapes(*args: Any, fn: Flat, shapes: Any, own: Any, chunk: int) -> list[Any]:
+def _shapes(*args: Any, fn: Flat, shapes: Any, levels: Levels, chunk: int) -> list[Any]:
     return list(itertools.starmap(jax.core.ShapedArray, shapes))
 
 

@@ -82,24 +82,34 @@ def _looped(rows: list[Rows], z: Rows, h: Lanes, parts: int) -> tuple[Rows, list
     return z, terms
 
 
+def _shifted(z: Rows, rows: list[Rows], by: Lanes) -> Rows:
+    """exp(X τ) z for a time that is zero and has derivatives: right to the fourth order in these."""
+    term, out = z, z[:-1]
+    for j in (1, 2, 3):
+        term = [*[full(dot(row, term), by) * (by * (1 / j)) for row in rows], None]
+        out = [x + w for x, w in zip(out, term)]
+    return [*out, z[-1]]
+
+
 @jax.custom_jvp
 def arrived(z: Rows, rows: list[Rows], guard: Rows, meets: Array) -> tuple[Lanes, Rows]:
-    """The time (zero) from z to the surface guard · z = 0 on which it is, and z there without its last component: their
-    derivatives are those of a solution of z' = X z that ends on the surface, where it `meets` one.
+    """The time (zero) from z to the surface guard · z = 0 on which it is, and z there: their derivatives are those of a
+    solution of z' = X z that ends on the surface, where it `meets` one.
 
     With the change dg of the guard at fixed time, dt = -dg / (dg/dt), and the state moves along the flow by dt. The
-    rule refers to this function again, so that derivatives of every order are right.
+    rule refers to this function again, for derivatives of higher orders.
     """
-    return jnp.zeros_like(z[0]), z[:-1]
+    return jnp.zeros_like(z[0]), z
 
 
 @arrived.defjvp
 def _arrived_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     z, rows, guard, meets = primals
-    dz, _, dguard, _ = tangents
-    shift, x = arrived(z, rows, guard, meets)
-    there = [*x, z[-1]]
-    f = [full(dot(row, there), shift) for row in rows]
-    slope, change = dot(guard[:-1], f), dot(guard, dz) + dot(dguard, there)
+    dz, drows, dguard, _ = tangents
+    shift, there = arrived(z, rows, guard, meets)
+    # The change at the time of the event, which in derivatives of higher orders is another one.
+    moves = jax.jvp(lambda z, rows: _shifted(z, rows, shift), (z, rows), (dz, drows))[1]
+    f = [*[full(dot(row, there), shift) for row in rows], jnp.zeros_like(shift)]
+    slope, change = dot(guard, f), dot(guard, moves) + dot(dguard, there)
     moved = jnp.where(meets, -change / jnp.where(meets, slope, 1), 0)
-    return (shift, x), (moved, [d + a * moved for d, a in zip(dz, f)])
+    return (shift, there), (moved, [d + a * moved for d, a in zip(moves, f)])

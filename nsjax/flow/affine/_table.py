@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
@@ -68,7 +69,16 @@ def economised(degree: int, terms: int) -> tuple[np.ndarray, np.ndarray]:
 
 def by_lane(fn: Callable[..., Any], *args: Any) -> Any:
     """A function of one lane for all of them."""
-    return eqx.filter_vmap(fn, in_axes=eqx.if_array(-1), out_axes=eqx.if_array(-1))(*args)
+    dynamic, static = eqx.partition(args, eqx.is_array)
+    rest: list[Any] = []
+
+    def one(dynamic: Any) -> Any:
+        found, other = eqx.partition(fn(*eqx.combine(dynamic, static)), eqx.is_array)
+        rest.append(other)
+        return found
+
+    found = jax.vmap(one, in_axes=-1, out_axes=-1)(dynamic)
+    return eqx.combine(found, rest[-1])
 
 
 def maps(flow: Flow, plan: Plan, y: Y, state: ModeState) -> tuple[Array, Array, Array | None]:

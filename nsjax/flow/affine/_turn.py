@@ -108,7 +108,7 @@ def go(plan: Plan, rows: list[Rows], guards: list[Rows], projection: Any, z: Row
     cosine = jnp.abs(rate) / jnp.sqrt((normal + drift**2) * (speed + jnp.where(drift == 0, 0, 1)))
     clear = (rate < -1e2 * small(like) * size) & (cosine > 1e2 * small(like))
     delay, moved = arrived(z, rows, w, event)
-    z = [*[stored(x) for x in moved], z[-1]]
+    z = [*[stored(x) for x in moved[:-1]], z[-1]]
     return There(z, shift + delay, rate, ~event | (close & clear), cosine, terms)
 
 
