@@ -24,8 +24,8 @@ def once(tree: Any) -> Any:
 
 @jax.custom_jvp
 def stored(x: Array) -> Array:
-    """`once`, and the same of derivatives: those of a batch of directions are divided by one number each, which XLA makes
-    a multiplication, and so copies."""
+    """`once`, and the same of derivatives. (Those of a batch of directions all have one divisor, of which XLA makes a
+    factor: a product, which it copies.)"""
     return once(x)
 
 

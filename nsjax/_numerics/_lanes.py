@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.core
 import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
@@ -68,11 +69,16 @@ def _chunked(fn: Flat, chunk: int, args: list[Any]) -> list[Any]:
     return [join(x) for x in lax.map(lambda xs: fn(*xs), [split(x) for x in args])]
 
 
-def _batch(args: Any, dims: Any, *, fn: Flat, shapes: Any, levels: Levels, chunk: int) -> tuple[list[Any], list[int | None]]:
+def _batch(
+    args: Any, dims: Any, *, fn: Flat, shapes: Any, levels: Levels, chunk: int
+) -> tuple[list[Any], list[int | None]]:
     size = next(x.shape[d] for x, d in zip(args, dims) if d is not None)
     batched = [d is not None for d in dims]
     if any(batched[: levels[0][0]]):
-        last = [jnp.moveaxis(spread(jnp.asarray(x), size) if d is None else x, 0 if d is None else d, -1) for x, d in zip(args, dims)]
+        last = [
+            jnp.moveaxis(spread(jnp.asarray(x), size) if d is None else x, 0 if d is None else d, -1)
+            for x, d in zip(args, dims)
+        ]
         results = _chunked(fn, chunk, last)
         return results, [x.ndim - 1 for x in results]
     # A batch of tangents alone (`jacfwd`) is none of lanes: what is differentiated stays as it is.

@@ -216,7 +216,9 @@ def test_float32():
 def test_lanes_of_lanes():
     """Batches within batches, more lanes than are run at a time, and a batch of directions within one of lanes."""
     v, x = np.linspace(0.2, 0.9, 150), np.array([2.0, 2.5])
-    many = jax.jit(jax.vmap(jax.vmap(lambda v, x: jnp.stack(slider(v, Motion(x, -0.5), 20.0).y1), (0, None)), (None, 0)))
+    many = jax.jit(
+        jax.vmap(jax.vmap(lambda v, x: jnp.stack(slider(v, Motion(x, -0.5), 20.0).y1), (0, None)), (None, 0))
+    )
     np.testing.assert_allclose(many(v, x)[1], reference.stick_slip_final(v, 20.0), atol=1e-12)
 
     def slope(v):

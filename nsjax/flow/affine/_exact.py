@@ -83,7 +83,9 @@ def _tabulated(problem: Problem, table: Table, used: Lanes, lane: Lane) -> tuple
     def build(args: tuple) -> tuple:
         table, used, index = args
         parts = tuple(None for _ in lane.modes)
-        new = _table_of(problem, ModeState.of(lane.modes, parts)._replace(roots=tuple(jnp.zeros_like(m) for m in lane.modes)))
+        new = _table_of(
+            problem, ModeState.of(lane.modes, parts)._replace(roots=tuple(jnp.zeros_like(m) for m in lane.modes))
+        )
         place = used % kept
         table = jax.tree.map(
             lambda old, x: jnp.stack([jnp.where(wanted & (place == i), x, old[i]) for i in range(kept)]), table, new
@@ -143,4 +145,3 @@ def _one_turn(flow: Flow, wanted: Array, carry: Carry) -> Carry:
         return jax.tree.map(lambda old, x: x.astype(old.dtype), dynamic, new)
 
     return eqx.combine(compact_cond(wanted, branch, (moving, dynamic), dynamic), static)
-

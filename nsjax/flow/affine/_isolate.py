@@ -42,7 +42,8 @@ def _look(a: Array, known: Int[Array, "rows lanes"], size: Array) -> _Look:
     first = jnp.where(known == 0, a[:, 0], jnp.where(known == 1, a[:, 1], jnp.where(known == 2, a[:, 2], a[:, 3])))
     kept = [jnp.where(known > j, first, a[:, j]) if j < 3 else a[:, j] for j in range(count)]
     signs = [x > 0 for x in kept]
-    variations = sum((p != q).astype(jnp.int32) for p, q in zip(signs, signs[1:]))
+    changes = [(p != q).astype(jnp.int32) for p, q in zip(signs, signs[1:])]
+    variations = sum(changes[1:], changes[0])
     weights = binomials(count - 1)
     least = ft.reduce(jnp.minimum, [x / w for x, w in zip(kept, weights)])
     largest = ft.reduce(jnp.maximum, [jnp.abs(x) / w for x, w in zip(kept, weights)])
@@ -96,9 +97,7 @@ def _horner(c: list[Array], x: Array) -> tuple[Array, Array, Array]:
     return value, slope, bend
 
 
-def root(
-    a: Float[Array, "coefficients lanes"], known: Int[Array, " lanes"], wanted: Truths
-) -> Lanes:
+def root(a: Float[Array, "coefficients lanes"], known: Int[Array, " lanes"], wanted: Truths) -> Lanes:
     """The only root on (0, 1] of polynomials with one sign variation, after those known at 0 have been divided out: by
     Halley's method from the eighth of the interval in which it is."""
     n = len(a) - 1
@@ -143,4 +142,3 @@ def root(
 
     u = lax.cond(jnp.any(poor), again, lambda u: u, u)
     return jnp.where(late, 1 - u, u)
-

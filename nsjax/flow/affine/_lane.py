@@ -156,7 +156,7 @@ def _put(buffer: Float[Array, "rows lanes"], place: Numbers, value: Lanes) -> Fl
 
 
 @_put.defjvp
-def _put_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+def _put_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Any]:
     (buffer, place, value), (dbuffer, _, dvalue) = primals, tangents
     out = _put(buffer, place, value)
     smooth = jnp.issubdtype(out.dtype, jnp.inexact)
@@ -178,4 +178,3 @@ def logged(log: Log, index: Numbers, when: Truths, row: tuple[Any, ...]) -> Log:
         return log.t, log.before, log.after, log.slot, log.modes, log.transversality
 
     return eqx.tree_at(columns, log, jax.tree.map(put, columns(log), row))
-

@@ -1,5 +1,5 @@
-"""Events at which there is nothing to choose: one switch crosses, begins to hold or lets go, or rebounds, and all others
-go on as before. All that is not plainly so is left to `transition`.
+"""Events at which there is nothing to choose: one switch crosses, begins to hold or lets go, or rebounds, and all
+others go on as before. All that is not plainly so is left to `transition`.
 """
 
 from typing import Any, NamedTuple
@@ -110,9 +110,7 @@ def _sign(flow: Flow, plan: Plan, constants: Constants, m: Meeting, k: int, rows
     return Plain(sure, m.z, modes, known, slot.astype(mode.dtype), forked)
 
 
-def _rebound(
-    flow: Flow, plan: Plan, constants: Constants, m: Meeting, k: int, held: dict[int, Truths]
-) -> Plain:
+def _rebound(flow: Flow, plan: Plan, constants: Constants, m: Meeting, k: int, held: dict[int, Truths]) -> Plain:
     """An impact by Newton's law, that is followed by a flight which is not brief."""
     model, n, one = flow.model, plan.size, jnp.ones_like(m.modes[k])
     tiny, eps = small(m.rate), float(jnp.finfo(m.rate.dtype).eps)

@@ -237,4 +237,3 @@ def numbers(model: SwitchedSystem) -> int:
         free = 2 if isinstance(switch, sgn) else 1
         count *= free + (k in model.holdable)
     return count
-

@@ -55,9 +55,7 @@ def economised(degree: int, terms: int) -> tuple[np.ndarray, np.ndarray]:
     """The matrix from coefficients of u^j, j <= `terms`, to scaled Bernstein coefficients of the truncated Chebyshev
     series; and what each power loses in this."""
     at = 0.5 - 0.5 * np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
-    basis = np.array(
-        [[math.comb(degree, i) * u**i * (1 - u) ** (degree - i) for i in range(degree + 1)] for u in at]
-    )
+    basis = np.array([[math.comb(degree, i) * u**i * (1 - u) ** (degree - i) for i in range(degree + 1)] for u in at])
     columns, lost = [], []
     for j in range(terms + 1):
         c = power(j)

@@ -91,7 +91,10 @@ def go(plan: Plan, rows: list[Rows], guards: list[Rows], projection: Any, z: Row
     nought = jnp.zeros_like(like)
     if not guards:
         return There(z, nought, nought, ~arc.doubtful, nought, terms)
-    w = [stored(sum(jnp.where(arc.fires[r], full(row[q], like), 0) for r, row in enumerate(guards))) for q in range(len(z))]
+    w = [
+        stored(sum(jnp.where(arc.fires[r], full(row[q], like), 0) for r, row in enumerate(guards)))
+        for q in range(len(z))
+    ]
     f = [full(dot(row, z), like) for row in rows]
     bend = [full(dot(row, [*f, None]), like) for row in rows]
     value, rate = frozen((dot(w, z), dot(w[:-1], f)))
@@ -207,7 +210,14 @@ def _written(problem: Problem, lane: Lane, end: End) -> Log:
     """The log with the events of this turn."""
     flow, plan, _, like, _ = problem
     before, after = (state_of(x, like) for x in (end.there.z[: plan.size], end.after.x))
-    row = (end.t * flow.model.direction, before, after, end.after.slot, jnp.stack(end.after.modes), end.there.transversality)
+    row = (
+        end.t * flow.model.direction,
+        before,
+        after,
+        end.after.slot,
+        jnp.stack(end.after.modes),
+        end.there.transversality,
+    )
     assert lane.log is not None
     return logged(lane.log, lane.events, end.event, frozen(row) if flow.still else row)
 
