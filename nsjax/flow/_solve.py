@@ -335,7 +335,7 @@ def solve(
         to rest. Where the solution is not unique this chooses one; without it static friction holds as long as it can,
         a repulsive surface that is reached is crossed, and a start on one is refused. `Solution.unique` tells.
     - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, Euler,
-        `nsjax.Taylor`, or for models that are affine in the state `nsjax.Exponential`.
+        `nsjax.Taylor`, or for models that are affine in the state `nsjax.Exponential` or, for sweeps, `nsjax.Affine`.
     - `stepsize_controller`: by default `diffrax.PIDController` with `rtol = atol = 1e-8` (1e-5 for float32).
     - `saveat`: as in diffrax: `t0`, `t1`, `ts`, `steps`, `fn(t, y, system)`, `dense`.
     - `dt0`: first step; chosen automatically by default.

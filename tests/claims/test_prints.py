@@ -185,6 +185,7 @@ def test_all_public_results_are_in_the_table():
         "Solution",
         "OrbitContinuation",
         "System",
+        "Affine",
         "Exponential",
         "Taylor",
         "RESULTS",
