@@ -113,6 +113,27 @@ def test_stick_slip():
         np.testing.assert_allclose(a[finite], b[finite], atol=1e-9 if name == "transversality" else 1e-11)
 
 
+def test_saved_steps_and_backwards():
+    """Steps are saved at events, before and after; what runs backwards does what it does in the general flow."""
+    sol = slider(0.5, t1=20.0, saveat=dfx.SaveAt(t0=True, t1=True, steps=True))
+    t = np.asarray(sol.ts)
+    for at in times(sol):
+        assert np.sum(t == at) == 2
+    path = reference.stick_slip_final
+    for time, x in list(zip(t, sol.ys.x))[:12]:
+        if time > 0:
+            np.testing.assert_allclose(x, path(np.array([0.5]), float(time))[0, 0], atol=1e-12)
+    for system, start, back in (
+        (gallery.StickSlip(v_dr=0.5), Motion(-1.0, 0.1), -6.0),
+        (Ball(), Motion(0.5, 0.6), -3.0),
+    ):
+        got, want = (solve(system, 0.0, back, start, solver=m, throw=False) for m in (Affine(), Exponential()))
+        assert got.result == want.result and itinerary(got) == itinerary(want)
+        assert bool(got.unique) == bool(want.unique)
+        np.testing.assert_allclose(times(got), times(want), atol=1e-11)
+        np.testing.assert_allclose(flat(got.y1), flat(want.y1), atol=1e-10)
+
+
 def end_of_slider(p, **options):
     return jnp.stack(slider(p[2], Motion(p[0], p[1]), **options).y1)
 

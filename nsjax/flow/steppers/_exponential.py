@@ -93,9 +93,9 @@ class Affine(Exponential):
 
     The guards on an arc are polynomials, made once for each mode that a lane comes to, which only find the event; its
     time and the state are those of the exact flow. Events at which there is nothing to choose are worked out for all
-    lanes of a batch at once. Whatever is not plainly so (events at one instant, accumulating impacts, contacts that lift
-    off, tangencies, ends on a surface) is left to the general loop; so are models with relays, clocks, surfaces of
-    several components or resets of their own, for which this is `Exponential`. In `nsjax.solve` tolerances play no role.
+    lanes of a batch at once. Whatever is not plainly so (events at one instant, accumulating impacts, contacts that
+    lift off, tangencies, ends on a surface) is left to the general loop; so are models with relays, clocks, surfaces
+    of several components or resets of their own, for which this is `Exponential`. Tolerances play no role.
 
     Sweeps of small systems take a tenth of the time of `Exponential`, or less; to compile the program takes up to twice
     as long.
