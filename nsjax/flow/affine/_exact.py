@@ -1,6 +1,7 @@
 """The loop of the exact flow: arcs of all lanes, as long as they are plain; then a turn of the general flow for those
 lanes that wait for it."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -13,7 +14,7 @@ from ..._numerics._lane_cond import compact_cond
 from ..._numerics._lanes import in_lanes
 from ...system._mode import ModeState
 from .._loop import Carry, Flow
-from ._lane import entered, Lane, Lanes, left, MISSING
+from ._lane import entered, Lane, Lanes, left, logged, MISSING, Row
 from ._plan import constants, made, numbers, Plan, Problem
 from ._table import by_lane, DEGREE, key_of, PHASE, Table, tabulate, THETA
 from ._turn import many, picked, saves, turn
@@ -120,7 +121,14 @@ def _general(problem: Problem, table: Table, carry: Carry, lane: Lane) -> tuple[
         carry, lane = args
         length = picked(table.length, lane.index)
         before = left(problem, lane, carry, jnp.where(many(flow, length), carry.dt, 0.3 * length))
-        after = by_lane(_one_turn, flow, waits, before)
+        if before.log is None:
+            after = by_lane(_one_turn, flow, waits, before)
+        else:  # not with the log itself, which is long
+            turned = dataclasses.replace(before, log=Row.blank(before.log))
+            after = by_lane(_one_turn, flow, waits, turned)
+            row: Any = after.log
+            log = logged(before.log, before.events, row.when & waits, row.row)
+            after = dataclasses.replace(after, log=log)
         return after, back(after, lane)
 
     def back(after: Carry, lane: Lane) -> Lane:

@@ -163,6 +163,21 @@ def _put_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Any]:
     return out, _put(dbuffer, place, dvalue) if smooth else np.zeros(out.shape, jax.dtypes.float0)
 
 
+class Row(eqx.Module):
+    """In place of a `Log` for one turn of one lane: what is written, and whether anything is."""
+
+    when: Any
+    row: tuple
+
+    @classmethod
+    def blank(cls, log: Log) -> "Row":
+        columns = log.t, log.before, log.after, log.slot, log.modes, log.transversality
+        return cls(jnp.zeros(log.t.shape[-1], bool), jax.tree.map(lambda x: x[0], columns))
+
+    def write(self, index: Any, when: Any, row: tuple) -> "Row":
+        return Row(when, jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), row, self.row))
+
+
 def logged(log: Log, index: Numbers, when: Truths, row: tuple[Any, ...]) -> Log:
     """`Log.write` for all lanes."""
 

@@ -94,10 +94,11 @@ def _sign(flow: Flow, plan: Plan, constants: Constants, m: Meeting, k: int, rows
     # With h' = gain (s - λ) on the side from which it comes, this is 1 - λ times the sign of that side.
     way = rate / jnp.where(gain == 0, 1, gain)
     holds = attracts & (way <= 1 + bound)
-    clear = (jnp.abs(way) > tiny) & (jnp.abs(way - 1 - bound) > tiny * (1 + bound)) & (gain != 0)
-    forked = holds & ~held & (way > 2)
+    clear = (jnp.abs(way) > tiny) & (jnp.abs(jnp.abs(way - 1) - bound) > tiny * (1 + bound)) & (gain != 0)
+    # With 1 < |λ| <= b it might hold or cross; what repels is crossed.
+    forked = ~held & jnp.where(attracts, holds & (way > 2), 1 - way <= bound)
     if model.static(k):
-        clear = clear & attracts & (jnp.abs(way - 2) > tiny)
+        clear = clear & (~attracts | (jnp.abs(way - 2) > tiny))
     side = jnp.where(m.fires[rows[0]], 1, -1)
     after = jnp.where(held, side, jnp.where(holds, 0, -mode)).astype(mode.dtype)
     # With b = 1 dh/dt is zero where λ reaches it.
