@@ -20,17 +20,13 @@ from nsjax import Affine, Exponential, gallery, RESULTS, solve
 
 
 SHAPES = {
-    "friction": Shape(2, 1, 0, 0, forced=True, moving=False),
+    "friction": Shape(2, 1, 0, 0, forced=True, moving=True),
     "bounce": Shape(2, 0, 0, 1, forced=True, moving=True),
-    "corners": Shape(4, 3, 0, 0, forced=True, moving=True),
-    "walls": Shape(4, 1, 0, 2, forced=True, moving=False),
-    "rest": Shape(4, 1, 0, 2, forced=True, moving=True, rest=True),
-    "all": Shape(6, 3, 0, 1, forced=False, moving=False),
+    "three states": Shape(3, 1, 0, 0, forced=False, moving=False),
 }
-QUICK = ("friction", "bounce")
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n not in QUICK)) for n in SHAPES])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "three states")) for n in SHAPES])
 def test_random_systems(name, monkeypatch):
     """Against exact solutions; with derivatives where that is compiled soon."""
     monkeypatch.setitem(test_fuzz.SHAPES, name, (SHAPES[name], Affine()))
@@ -275,6 +271,48 @@ def test_chain_of_blocks():
     assert itinerary(got) == itinerary(want) and len(itinerary(got)) > 10
     np.testing.assert_allclose(times(got), times(want), atol=1e-11)
     np.testing.assert_allclose(flat(got.y1), flat(want.y1), atol=1e-11)
+
+
+class Pulled(nsjax.System):
+    """A block on a belt, and by a spring another one in front of a wall."""
+
+    v_dr: float = 0.3
+
+    def vector_field(self, t, y, s):
+        force = jnp.stack([-y.x[0] - s.belt, jnp.cos(1.7 * t) - s.wall]) + 0.4 * jnp.stack([1.0, -1.0]) * (
+            y.x[1] - y.x[0]
+        )
+        return Motion(y.v, force)
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y.v[0] - self.v_dr
+
+    @belt.breakaway
+    def belt(self):
+        return 1.4
+
+    @nsjax.impact
+    def wall(self, t, y):
+        return 0.6 - y.x[1]
+
+    @wall.restitution
+    def wall(self):
+        return 0.7
+
+
+def test_two_switches():
+    """Friction and impacts of two bodies: a sweep against the general flow, almost all of it from event to event."""
+    v = np.linspace(0.1, 0.9, 24)
+    got, want = (
+        jax.jit(jax.vmap(lambda v, m=m: solve(Pulled(v), 0.0, 20.0, Motion(jnp.zeros(2), jnp.ones(2)), solver=m)))(v)
+        for m in (Affine(), Exponential())
+    )
+    assert np.array_equal(got.events.num, want.events.num) and np.array_equal(got.unique, want.unique)
+    assert np.array_equal(got.events.switch, want.events.switch)
+    assert np.array_equal(got.events.mode_after, want.events.mode_after)
+    np.testing.assert_allclose(flat(got.y1), flat(want.y1), atol=1e-10)
+    assert np.median(got.stats["num_steps"]) < 0.5 * np.median(want.stats["num_steps"])
 
 
 class Switched(nsjax.System):

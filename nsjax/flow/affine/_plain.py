@@ -1,5 +1,6 @@
 """Events at which there is nothing to choose: one switch crosses, begins to hold or lets go, or rebounds, and all
-others go on as before. All that is not plainly so is left to `transition`.
+others go on as before, as no switch acts on the surface of another one. All that is not plainly so is left to
+`transition`.
 """
 
 from typing import Any, NamedTuple
@@ -56,19 +57,14 @@ def plain(flow: Flow, plan: Plan, constants: Constants, m: Meeting) -> Plain:
     model, none = flow.model, jnp.zeros_like(m.modes[0])
     yes = jnp.ones_like(m.fires[0])
     out = Plain(yes, m.z[: plan.size], m.modes, [none] * len(plan.rows), none, ~yes)
-    held = {k: model.held(k, m.modes[k]) for k in model.holdable}
     for k, switch in enumerate(model.switches):
         rows = [r for r, row in enumerate(plan.rows) if row.switch == k]
         now = m.fires[rows[0]] | m.fires[rows[-1]]
-        others = [held[j] for j in model.holdable if j != k]
-        busy = sum(others[1:], others[0]) if others else ~yes
         if isinstance(switch, impact):
-            new = _rebound(flow, plan, constants, m, k, held)
+            new = _rebound(flow, plan, constants, m, k)
         else:
             new = _sign(flow, plan, constants, m, k, rows)
-        # What it does to the multipliers of others that hold is not looked at.
-        sure = new.sure if model.apart[k] else new.sure & ~busy
-        sure = sure & (not switch.ends)
+        sure = new.sure & (not switch.ends)
         out = Plain(
             jnp.where(now, sure, out.sure),
             [jnp.where(now, a, b) for a, b in zip(new.x, out.x)] if new.x is not m.z else out.x,
@@ -111,7 +107,7 @@ def _sign(flow: Flow, plan: Plan, constants: Constants, m: Meeting, k: int, rows
     return Plain(sure, m.z, modes, known, slot.astype(mode.dtype), forked)
 
 
-def _rebound(flow: Flow, plan: Plan, constants: Constants, m: Meeting, k: int, held: dict[int, Truths]) -> Plain:
+def _rebound(flow: Flow, plan: Plan, constants: Constants, m: Meeting, k: int) -> Plain:
     """An impact by Newton's law, that is followed by a flight which is not brief."""
     model, n, one = flow.model, plan.size, jnp.ones_like(m.modes[k])
     tiny, eps = small(m.rate), float(jnp.finfo(m.rate.dtype).eps)
@@ -134,9 +130,4 @@ def _rebound(flow: Flow, plan: Plan, constants: Constants, m: Meeting, k: int, h
     for r, others in enumerate(m.guards):
         if r != row:
             sure = sure & (dot(frozen(others), z) > tiny * magnitude(frozen(others), z))
-    for j in model.holdable:
-        if j in model.contacts:  # what rests takes impulses of its own
-            sure = sure & ~held[j]
-        else:  # what slides is not knocked off its surface
-            sure = sure & ~(held[j] & (frozen(constants.kick[k, j]) != 0))
     return Plain(sure, x, m.modes, known, plan.rows[row].free * one, rise != rise)  # type: ignore

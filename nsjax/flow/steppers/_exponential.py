@@ -95,7 +95,8 @@ class Affine(Exponential):
     time and the state are those of the exact flow. Events at which there is nothing to choose are worked out for all
     lanes of a batch at once. Whatever is not plainly so (events at one instant, accumulating impacts, contacts that
     lift off, tangencies, ends on a surface) is left to the general loop; so are models with relays, clocks, surfaces
-    of several components or resets of their own, for which this is `Exponential`. Tolerances play no role.
+    of several components or resets of their own, or in which one switch acts on the surface of another one (friction
+    and a wall on one body), for which this is `Exponential`. Tolerances play no role.
 
     Sweeps of small systems take a tenth of the time of `Exponential`, or less; to compile the program takes up to twice
     as long.
