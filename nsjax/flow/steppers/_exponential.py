@@ -98,8 +98,8 @@ class Affine(Exponential):
     of several components or resets of their own, or in which one switch acts on the surface of another one (friction
     and a wall on one body), for which this is `Exponential`. Tolerances play no role.
 
-    Sweeps of small systems take a tenth of the time of `Exponential`, or less; to compile the program takes up to twice
-    as long.
+    Sweeps of small systems take a sixth to a twelfth of the time of `Exponential`; to compile the program takes up to
+    twice as long.
     """
 
 
