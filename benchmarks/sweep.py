@@ -115,7 +115,8 @@ def measure_all(workload: str, args: argparse.Namespace) -> list[Measured]:
         for peer in ("heyoka", "heyoka-batch"):
             rows.append(measure(peer, tol, values, **options))
     for batch in [b or None for b in args.batch]:  # its error does not depend on the tolerance
-        rows.append(measure_nsjax(tol=min(args.tol), solver=nsjax.Exponential(), values=values, batch=batch, **options))
+        for exact in (nsjax.Exponential(), nsjax.Affine()):
+            rows.append(measure_nsjax(tol=min(args.tol), solver=exact, values=values, batch=batch, **options))
     scipy = measure("DOP853", min(args.tol), few, workload=workload, repeats=1)
     rows.append(scipy._replace(seconds=scipy.seconds * args.lanes / args.scipy_lanes, lanes=args.lanes))
     return rows

@@ -44,6 +44,7 @@ from .equilibria import (
     find_equilibrium as find_equilibrium,
 )
 from .flow import (
+    Affine as Affine,
     Exponential as Exponential,
     is_okay as is_okay,
     RESULTS as RESULTS,

@@ -20,3 +20,15 @@ def once(tree: Any) -> Any:
         return x / jnp.where(x == x, 1, lax.stop_gradient(x))
 
     return jax.tree.map(leaf, tree)
+
+
+@jax.custom_jvp
+def stored(x: Array) -> Array:
+    """`once`, and the same of derivatives. (Those of a batch of directions all have one divisor, of which XLA makes a
+    factor: a product, which it copies.)"""
+    return once(x)
+
+
+@stored.defjvp
+def _stored_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    return stored(*primals), stored(*tangents)

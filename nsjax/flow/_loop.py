@@ -265,11 +265,11 @@ class Flow(eqx.Module):
         moved = step.keep | event
         events, halted, grazed, forked, log = c.events, c.halted, c.grazed, c.forked, c.log
         if model.slots:
-            assert log is not None
             at, news = there.t_after * model.direction, event & there.news
             slot, mode = there.slot.astype(jnp.int32), jnp.stack(there.state.mode)
             row = (at, there.y_before, there.y_after, slot, mode, there.transversality)
-            log = log.write(events, news, frozen(row) if self.still else row)
+            if log is not None:
+                log = log.write(events, news, frozen(row) if self.still else row)
             grazed, forked = grazed | (event & there.grazes), forked | (moved & there.forked)
             events = events + news.astype(jnp.int32)
             halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(step.keep, 0, halted))

@@ -29,8 +29,10 @@ from ._loop import Carry, finite, Flow
 from ._results import is_okay, raise_if, RESULTS, SolveError
 from ._save import Log, Request, Saved, times_in_order
 from ._solution import Events, Solution
+from .affine._exact import exactly
+from .affine._plan import allows
 from .events._initial_mode import start_mode
-from .steppers._exponential import Exponential, ExponentialStepper
+from .steppers._exponential import Affine, Exponential, ExponentialStepper
 from .steppers._stepper import RungeKutta, Stepper
 from .steppers._taylor import Taylor, TaylorStepper
 
@@ -75,7 +77,9 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     flow = _flow(model, stepper, (start, stop), y0, state, options)
     result = _obstacle(flow, y0, state, options.saveat, result)
     carry = _first_turn(flow, y0, state, forked, result, options)
-    c = _looped(flow, _tied(jax.tree.map(_strong, carry), (system, t0, t1, y0)), options.integrator.adjoint)
+    carry = _tied(jax.tree.map(_strong, carry), (system, t0, t1, y0))
+    exact = isinstance(options.integrator.solver, Affine) and allows(flow, state, start, y0)
+    c = exactly(flow, carry) if exact else _looped(flow, carry, options.integrator.adjoint)
     sol = _solution(flow, c, t0, state, Request.of(options.saveat).t1)
     if options.throw:
         # (What is transposed has been computed before.)
@@ -331,7 +335,7 @@ def solve(
         to rest. Where the solution is not unique this chooses one; without it static friction holds as long as it can,
         a repulsive surface that is reached is crossed, and a start on one is refused. `Solution.unique` tells.
     - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, Euler,
-        `nsjax.Taylor`, or for models that are affine in the state `nsjax.Exponential`.
+        `nsjax.Taylor`, or for models that are affine in the state `nsjax.Exponential` or, for sweeps, `nsjax.Affine`.
     - `stepsize_controller`: by default `diffrax.PIDController` with `rtol = atol = 1e-8` (1e-5 for float32).
     - `saveat`: as in diffrax: `t0`, `t1`, `ts`, `steps`, `fn(t, y, system)`, `dense`.
     - `dt0`: first step; chosen automatically by default.

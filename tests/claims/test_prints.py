@@ -186,6 +186,7 @@ def test_all_public_results_are_in_the_table():
         "EquilibriumContinuation",
         "OrbitContinuation",
         "System",
+        "Affine",
         "Exponential",
         "Taylor",
         "RESULTS",
