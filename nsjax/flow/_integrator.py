@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from diffrax._root_finder import use_stepsize_tol
 from jax.core import Tracer
 
-from .steppers._exponential import Exponential
+from .steppers._exponential import AbstractExponential
 
 
 class Integrator(NamedTuple):
@@ -41,10 +41,10 @@ class Integrator(NamedTuple):
         for name, value in (("max_steps", self.max_steps), ("max_events", self.max_events)):
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"Argument `{name}` must be a positive integer, but got {value!r}.")
-        if isinstance(solver, Exponential) and isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
+        if isinstance(solver, AbstractExponential) and isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
             raise ValueError(
-                "Argument `adjoint` must not be `RecursiveCheckpointAdjoint` for `Exponential`, whose matrix "
-                "exponential is a loop of unknown length; use `diffrax.DirectAdjoint()`."
+                "Argument `adjoint` must not be `RecursiveCheckpointAdjoint` for `Exponential` or `Affine`, whose "
+                "matrix exponential is a loop of unknown length; use `diffrax.DirectAdjoint()`."
             )
         controller = _controller(self.stepsize_controller, dtype, tolerance)
         return self._replace(solver=_implicit(solver, controller, adjoint), stepsize_controller=controller)

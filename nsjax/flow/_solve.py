@@ -32,7 +32,7 @@ from ._solution import Events, Solution
 from .affine._exact import exactly
 from .affine._plan import allows
 from .events._initial_mode import start_mode
-from .steppers._exponential import Affine, Exponential, ExponentialStepper
+from .steppers._exponential import AbstractExponential, Affine, ExponentialStepper
 from .steppers._stepper import RungeKutta, Stepper
 from .steppers._taylor import Taylor, TaylorStepper
 
@@ -237,7 +237,7 @@ def _stepper(integrator: Integrator) -> Stepper:
     solver = integrator.solver
     if isinstance(solver, Taylor):
         return TaylorStepper(solver)
-    if isinstance(solver, Exponential):
+    if isinstance(solver, AbstractExponential):
         return ExponentialStepper(solver)
     return RungeKutta(solver, isinstance(integrator.adjoint, dfx.RecursiveCheckpointAdjoint))
 

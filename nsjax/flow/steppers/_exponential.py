@@ -46,21 +46,8 @@ class _Samples(dfx.AbstractLocalInterpolation):
         return bernstein(self.points, (t0 - self.t0) / jnp.where(self.t1 == self.t0, 1, self.t1 - self.t0))
 
 
-class Exponential(dfx.AbstractAdaptiveSolver):
-    """A diffrax solver by the matrix exponential, for fields affine in the state, with forcing that is constant,
-    linear or quadratic in time, harmonic (of one frequency) or exponential.
-
-    A step is exact apart from rounding, whatever its length: also for defective and singular matrices, in resonance,
-    for sliding modes, and for stiff modes once they have decayed. Its length is only what a polynomial of degree 10 can
-    stand for, which is where events are looked for and what dense output is made of, to about 1e-11 of the state's
-    size along the step (1e-5 in single precision). In `nsjax.solve` tolerances play no role; of a
-    `diffrax.PIDController` only `dtmax` matters.
-
-    **Raises:** `ValueError` on use if the field is not affine in the state, or its matrix depends on time.
-    `nsjax.solve` ends with `RESULTS.mode_not_affine` where it meets forcing of another kind (two frequencies), or
-    begins to slide, stick or rest where the field that does so is not affine (curved surfaces, friction by a contact
-    force).
-    """
+class AbstractExponential(dfx.AbstractAdaptiveSolver):
+    """What the solvers by the matrix exponential have in common: one step in one mode."""
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., dfx.AbstractLocalInterpolation]] = _Samples
@@ -88,7 +75,24 @@ class Exponential(dfx.AbstractAdaptiveSolver):
         return y1, error, dict(y0=y0, points=stack(_control_points(ys))), None, dfx.RESULTS.successful
 
 
-class Affine(Exponential):
+class Exponential(AbstractExponential):
+    """A diffrax solver by the matrix exponential, for fields affine in the state, with forcing that is constant,
+    linear or quadratic in time, harmonic (of one frequency) or exponential.
+
+    A step is exact apart from rounding, whatever its length: also for defective and singular matrices, in resonance,
+    for sliding modes, and for stiff modes once they have decayed. Its length is only what a polynomial of degree 10 can
+    stand for, which is where events are looked for and what dense output is made of, to about 1e-11 of the state's
+    size along the step (1e-5 in single precision). In `nsjax.solve` tolerances play no role; of a
+    `diffrax.PIDController` only `dtmax` matters.
+
+    **Raises:** `ValueError` on use if the field is not affine in the state, or its matrix depends on time.
+    `nsjax.solve` ends with `RESULTS.mode_not_affine` where it meets forcing of another kind (two frequencies), or
+    begins to slide, stick or rest where the field that does so is not affine (curved surfaces, friction by a contact
+    force).
+    """
+
+
+class Affine(AbstractExponential):
     """`Exponential`, and for models whose switches are `sgn` and `impact` the flow from event to event in one step.
 
     The guards on an arc are polynomials, made once for each mode that a lane comes to, which only find the event; its
