@@ -27,7 +27,8 @@ matplotlib.use("Agg")
 gc.set_threshold(100_000, 20, 20)  # tracing makes many objects, and looking through them takes a fifth of its time
 
 
-MOST = 1.2e9  # bytes of a process, from which on it forgets between two tests of a file too
+MOST, MORE = 1.3e9, 4e8  # bytes of a process from which on it forgets between two tests of a file too, if it has grown
+kept = [0]  # bytes that were left then, of which the system gets nothing back
 
 
 def forget():
@@ -36,6 +37,7 @@ def forget():
     gc.collect()
     if sys.platform == "linux":  # which keeps what was freed, until it is told not to
         ctypes.CDLL("libc.so.6").malloc_trim(0)
+    kept[0] = size()
 
 
 def size():
@@ -56,5 +58,5 @@ def forgotten():
 def bounded():
     """Some files have more programs than fit."""
     yield
-    if size() > MOST:
+    if size() > max(MOST, kept[0] + MORE):
         forget()

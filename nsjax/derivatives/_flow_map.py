@@ -58,6 +58,7 @@ def flow_map(
     solution has derivatives."""
     numbers, rest = eqx.partition(system, eqx.is_inexact_array)
     where = (t0, t1, y0, mode, integrator, directions)
+    _FOLLOWED.add(_kind(system, y0, mode, integrator))
     sol, tangents = _flow_map(numbers, rest, *where)
     lost = ~np.isfinite(tangents).all() and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(sol.y1))
     if not lost:
@@ -70,6 +71,19 @@ def flow_map(
     numbers, rest = eqx.partition(system, moves)
     directions = directions._replace(system=eqx.filter(directions.system, moves))
     return _flow_map(numbers, rest, *where[:-1], directions)
+
+
+_FOLLOWED: set[Any] = set()  # kinds of problems whose program was needed already
+
+
+def _kind(system: System, y0: Y, mode: Any, integrator: Integrator) -> Any:
+    return jax.tree.structure((system, y0, mode, integrator))
+
+
+def is_followed(system: System, y0: Y, mode: Any, integrator: Integrator) -> bool:
+    """Whether the program of the flow map is there, as far as can be told: it takes twice as long to compile as that of
+    a solution alone."""
+    return _kind(system, y0, mode, integrator) in _FOLLOWED
 
 
 def solution(system: System, t0: Scalar, t1: Scalar, y0: Y, mode: Any, integrator: Integrator) -> Solution:

@@ -1,6 +1,7 @@
 """`find_orbit` where all numbers are known: Python calls one program, and finds what the traced search finds."""
 
 import contextlib
+import dataclasses
 
 import diffrax
 import jax
@@ -77,6 +78,17 @@ def test_a_point_on_a_surface_needs_its_mode():
     stick = next(e for e in orbit.events if e.mode_after == {"belt": 0})
     assert passage(orbit, stick.t, stick.y_after, (0,)) is not None  # attracted, so that it is the only way
     assert passage(orbit, orbit.t0, orbit.y0, (0,)) is None
+
+
+def test_a_program_that_is_not_there_is_not_compiled_for_a_picture():
+    """The flow map has twice the size of a solution."""
+
+    class Other(gallery.StickSlip):
+        pass
+
+    orbit = find_orbit(gallery.thesis("3.4"), Motion(2.02, 0.0), period=13.54)
+    assert passage(orbit, orbit.t0, orbit.y0, orbit.mode) is not None
+    assert passage(dataclasses.replace(orbit, system=Other()), orbit.t0, orbit.y0, orbit.mode) is None
 
 
 class Rotor(nsjax.System):
