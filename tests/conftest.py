@@ -27,7 +27,7 @@ matplotlib.use("Agg")
 gc.set_threshold(100_000, 20, 20)  # tracing makes many objects, and looking through them takes a fifth of its time
 
 
-MOST, MORE = 1.3e9, 4e8  # bytes of a process from which on it forgets between two tests of a file too, if it has grown
+MOST, MORE = 1.6e9, 6e8  # bytes of a process from which on it forgets between two tests of a file too, if it has grown
 kept = [0]  # bytes that were left then, of which the system gets nothing back
 
 
