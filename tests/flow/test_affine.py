@@ -26,7 +26,7 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "three states")) for n in SHAPES])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n != "bounce")) for n in SHAPES])
 def test_random_systems(name, monkeypatch):
     """Against exact solutions; with derivatives where that is compiled soon."""
     monkeypatch.setitem(test_fuzz.SHAPES, name, (SHAPES[name], Affine()))
@@ -109,6 +109,7 @@ def test_stick_slip():
         np.testing.assert_allclose(a[finite], b[finite], atol=1e-9 if name == "transversality" else 1e-11)
 
 
+@pytest.mark.slow
 def test_saved_steps_and_backwards():
     """Steps are saved at events, before and after; what runs backwards does what it does in the general flow."""
     sol = slider(0.5, t1=20.0, saveat=dfx.SaveAt(t0=True, t1=True, steps=True))
@@ -181,6 +182,7 @@ def bounced(p):
     return jnp.stack([up * rest - g * rest**2 / 2, up - g * rest])
 
 
+@pytest.mark.slow
 def test_derivatives_of_an_impact():
     """First and second, by all arguments and the time, against those of the closed form. (Third ones are right too, but
     take minutes to compile.)"""
@@ -210,6 +212,7 @@ def test_bounces_to_rest():
     assert got.unique
 
 
+@pytest.mark.slow
 def test_bounds_and_one_bad_lane():
     """Limits are kept to; a lane that fails does so alone."""
     for name in ("max_events", "max_steps"):
@@ -230,6 +233,7 @@ def test_float32():
     np.testing.assert_allclose(flat(sol.y1), reference.stick_slip_final(np.array([0.5]), 20.0)[0], atol=2e-5)
 
 
+@pytest.mark.slow
 def test_lanes_of_lanes():
     """Batches within batches, more lanes than are run at a time, and a batch of directions within one of lanes."""
     v, x = np.linspace(0.2, 0.9, 150), np.array([2.0, 2.5])
@@ -301,6 +305,7 @@ class Pulled(nsjax.System):
         return 0.7
 
 
+@pytest.mark.slow
 def test_two_switches():
     """Friction and impacts of two bodies: a sweep against the general flow, almost all of it from event to event."""
     v = np.linspace(0.1, 0.9, 24)
