@@ -102,7 +102,7 @@ class Affine(AbstractExponential):
     of several components or resets of their own, or in which one switch acts on the surface of another one (friction
     and a wall on one body), for which this is `Exponential`. Tolerances play no role.
 
-    Sweeps of small systems take a sixth to a twelfth of the time of `Exponential`; to compile the program takes up to
+    Sweeps of small systems take a sixth to a twentieth of the time of `Exponential`; to compile the program takes up to
     twice as long.
     """
 
