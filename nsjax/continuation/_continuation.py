@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Generic, ParamSpec, Self, TypeVar
 import jax.numpy as jnp
 
 from ..system._model import SwitchedSystem
-from ..system._parameter import parameter_path
+from ..system._parameter import parameter_path, Path
 from ._archive import Archive, save, table, Types
 from ._branch import AbstractBranch, BranchSegment
 from ._explorer import AbstractExplorer, Tree
@@ -22,7 +22,7 @@ from ._tracer import P, Trace, Zero
 
 BranchT = TypeVar("BranchT", bound=AbstractBranch)
 Arguments = ParamSpec("Arguments")
-GIVEN = ("model", "path", "like", "integrator", "curve", "tracer", "recorder")  # what follows from the rest
+GIVEN = ("model", "path", "free", "like", "integrator", "curve", "tracer", "recorder")  # what follows from the rest
 
 
 class AbstractContinuation(abc.ABC, Generic[P, BranchT]):
@@ -91,16 +91,17 @@ class AbstractContinuation(abc.ABC, Generic[P, BranchT]):
         return {}
 
     @classmethod
-    def _loaded(cls, archive: Archive, progress: bool, for_curve: dict[str, Any], for_explorer: dict[str, Any]) -> Self:
-        """From a file, with what that does not hold."""
+    def _loaded(
+        cls, archive: Archive, progress: bool, for_curve: Callable[[Path], dict[str, Any]], for_explorer: dict[str, Any]
+    ) -> Self:
+        """From a file, with what that does not hold: of the curve, given the path of its parameter."""
         curve_type, tracer_type, explorer_type = cls._parts
         given, time = archive.part("explorer"), jnp.zeros(())  # of which the model takes the shape only
         curve = curve_type(
             model=SwitchedSystem.forwards(archive.system, time, archive.y),
-            path=parameter_path(archive.system, given["name"]),
             like=archive.y,
             **archive.part("curve"),
-            **for_curve,
+            **for_curve(parameter_path(archive.system, given["name"])),
         )
         explorer = explorer_type(tracer_type(curve, **archive.part("tracer")), **given, **for_explorer)
         return cls.__new__(cls)._begin(explorer, archive.part("tree", curve=curve), progress)

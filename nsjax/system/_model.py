@@ -23,7 +23,6 @@ from .._types import Mode, Scalar, Y
 from ._clocked import Clocked
 from ._coupling import Coupling
 from ._mode import BEYOND, ModeState, OFF, pick, put, Slot
-from ._parameter import Path, put_parameter
 from ._sliding import linearised, project, resolved
 from ._system import System
 
@@ -147,9 +146,6 @@ class SwitchedSystem(Clocked):
     def with_system(self, system: System) -> "SwitchedSystem":
         """The same structure with other parameters."""
         return eqx.tree_at(lambda m: m.system, self, system)
-
-    def with_parameter(self, path: Path, value: Any) -> "SwitchedSystem":
-        return self.with_system(put_parameter(self.system, path, value))
 
     def state_at(self, t: Scalar, y: Y, mode: tuple) -> ModeState:
         """A mode, with the component of each h that is active at a state: the least."""

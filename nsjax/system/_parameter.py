@@ -1,4 +1,4 @@
-"""A parameter of a system, by its name."""
+"""Parameters of a system, by their names."""
 
 import dataclasses
 import functools as ft
@@ -6,15 +6,18 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool
 
 from .._numerics._text import did_you_mean
 from ._system import is_number, System
 
 
-Path = tuple[str, ...] | tuple[tuple[str, ...], ...]  # of one parameter, or of several
+Path = tuple[str, ...]
 
 
-def parameter_path(system: System, name: Any) -> tuple[str, ...]:
+def parameter_path(system: System, name: Any) -> Path:
     """Where the parameter is. It is called by its own name, for one of a system that another one wraps, as `smoothed`
     does, or of an effect of a scene, too; or by that after some or all of the names that lead there, as `system.mu`,
     `belt.v`.
@@ -65,14 +68,52 @@ def _members(node: Any) -> dict[str, Any]:
     return {name: getattr(node, name) for name in names}
 
 
-def get_parameter(system: System, path: tuple[str, ...]) -> Any:
+def get_parameter(system: System, path: Path) -> Any:
     return ft.reduce(getattr, path, system)
 
 
 def put_parameter(system: System, path: Path, value: Any) -> System:
-    """With another value of a parameter; or of several, from a vector."""
-    if path and not isinstance(path[0], str):
-        for i, one in enumerate(path):
-            system = put_parameter(system, one, value[i])
-        return system
+    """With another value of a parameter."""
     return eqx.tree_at(lambda m: get_parameter(m, path), system, value)
+
+
+class FreeParameters(eqx.Module):
+    """Which parameters of a system vary. That is an array, so that one program serves for all of them.
+
+    `every`: all that it has. `free`: for each free one a row, which is true at its place; a tuple where it is `fixed`.
+    """
+
+    every: tuple[Path, ...] = eqx.field(static=True)
+    free: Bool[Array, "number every"] | tuple[tuple[bool, ...], ...]
+
+    @classmethod
+    def of(cls, system: System, *paths: Path) -> "FreeParameters":
+        every = tuple(_paths(system)) if paths else ()
+        rows = [[path == one for one in every] for path in paths]
+        return cls(every, np.array(rows, bool).reshape(len(paths), len(every)))
+
+    @property
+    def fixed(self) -> "FreeParameters":
+        """The same for programs of their own."""
+        return FreeParameters(self.every, tuple(tuple(map(bool, row)) for row in self.free))
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Those of the free ones, where they are known."""
+        return tuple(self.every[list(row).index(True)] for row in self.free)
+
+    def put(self, system: System, values: Any) -> System:
+        """With these values: a number if one is free, else a vector."""
+        if not len(self.free):
+            return system
+        values = jnp.reshape(values, (len(self.free),))
+        if not isinstance(self.free, Tracer):
+            for path, value in zip(self.paths, values):
+                system = put_parameter(system, path, value)
+            return system
+        for i, path in enumerate(self.every):
+            value = get_parameter(system, path)
+            for row, new in zip(self.free, values):
+                value = jnp.where(row[i], new, value)
+            system = put_parameter(system, path, value)
+        return system

@@ -11,6 +11,7 @@ import pytest
 from branches import continue_orbit, orbit_of
 from jax import Array
 from models import Duffing, Motion, Support
+from programs import compilations
 from scipy import optimize
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -281,6 +282,22 @@ def test_infinitely_unstable_folds():
 def test_mistakes(duffing, change, message):
     with pytest.raises(ValueError, match=message):
         continue_bifurcation(duffing.bifurcations[0], **(dict(parameter="F", interval=(0.5, 1.5)) | change))
+
+
+def test_another_parameter_is_no_new_program(duffing):
+    """Issue 22: of one parameter, or of two."""
+    system, fold = Duffing(), duffing.bifurcations[0]
+    orbit = orbit_of(system, Motion(0.5, 0.0))
+    with compilations() as compiled:
+        branch = continue_orbit(system, orbit, "F", (0.9, 1.1))
+        assert len(branch) > 3 and not compiled
+        first = continue_bifurcation(fold, "F", (0.9, 1.1))
+        assert compiled  # two parameters are another one
+        count = len(compiled)
+        second = continue_bifurcation(fold, "c", (0.18, 0.22))
+        assert len(compiled) == count
+    for curve, name in ((first, "F"), (second, "c")):
+        assert len(curve) > 3 and curve.parameters == ("omega", name) and np.ptp(curve.values[:, 1]) > 0.03
 
 
 def test_a_loaded_point(duffing):

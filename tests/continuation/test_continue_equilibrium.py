@@ -79,7 +79,7 @@ CASES = {
 
 
 # Of these every run of the tests makes sure, of the others the slow ones (and the notebook on equilibria).
-QUICK = ("(5.11)", "(5.17), α = -1", "(5.18)", "(5.25)", "(5.29)", "(5.32)")
+QUICK = ("(5.17), α = -1", "(5.18)", "(5.25)", "(5.29)", "(5.32)")
 
 
 def marked(names):
@@ -514,6 +514,7 @@ def test_wherever_in_the_interval(kind):
         np.testing.assert_allclose(found[0].value, m, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_at_one_place_at_once():
     """Two Hopf bifurcations, or two pitchforks, at one place or so close that no step tells them apart."""
     for d in (0.0, 1e-5):
@@ -660,6 +661,7 @@ def test_orbits_born_at_a_hopf_point():
         )
 
 
+@pytest.mark.slow
 def test_orbits_born_subcritically():
     """α = 1: the unstable orbit of radius √d is below."""
     system = gallery.Hopf(-1.0, alpha=1.0)

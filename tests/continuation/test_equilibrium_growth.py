@@ -112,6 +112,7 @@ def test_interrupted(grown, tmp_path, monkeypatch):
     same(growth.branch, whole.branch)
 
 
+@pytest.mark.slow
 def test_at_every_point(tmp_path):
     """Saved and loaded between any two, at a corner at which three branches meet: nodes are still one."""
     what = gallery.DiscontinuousPitchfork(-1.0), Line(0.0), "mu", (-1.0, 1.0)

@@ -26,7 +26,8 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n != "bounce")) for n in SHAPES])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SHAPES)
 def test_random_systems(name, monkeypatch):
     """Against exact solutions; with derivatives where that is compiled soon."""
     monkeypatch.setitem(test_fuzz.SHAPES, name, (SHAPES[name], Affine()))
@@ -62,8 +63,10 @@ SOLUTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", SOLUTIONS)
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(
+    "name, sign",
+    [pytest.param(n, s, marks=[pytest.mark.slow] * (s < 0 and n != "harmonic")) for n in SOLUTIONS for s in (1, -1)],
+)
 def test_against_closed_forms(name, sign):
     """The end, both ways in time, dense output and saved times."""
     system, exact = SOLUTIONS[name]
@@ -201,6 +204,7 @@ def test_derivatives_of_an_impact():
         np.testing.assert_allclose(got, want, atol=1e-12 * np.abs(want).max())
 
 
+@pytest.mark.slow
 def test_bounces_to_rest():
     """Accumulating impacts end at rest, as in the general flow, whose they are once flights are brief."""
     got, want = (
@@ -226,6 +230,7 @@ def test_bounds_and_one_bad_lane():
     np.testing.assert_allclose(jnp.stack(sol.y1, 1)[np.array([0, 2])], want, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_float32():
     v = jnp.float32(0.5)
     sol = slider(v, Motion(jnp.float32(2.5), jnp.float32(-0.5)), jnp.float32(20))

@@ -233,6 +233,7 @@ def test_gallery(key):
     np.testing.assert_allclose(flat(changed), flat(change), atol=1e-8 * (1 + np.abs(flat(change)).max()))
 
 
+@pytest.mark.slow
 def test_float32():
     """Single precision: what it can hold."""
     system = gallery.StickSlip(v_dr=jnp.float32(0.5))

@@ -40,6 +40,7 @@ def test_a_brake_squeals_from_its_hopf_point_on(c):
     np.testing.assert_allclose(hopf.period, 2 * np.pi / np.sqrt(2.0), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_brake_squeals_with_stick():
     """Beyond it small oscillations grow until the pad sticks to the disc."""
     brake = gallery.BrakePad(mu=0.85)
@@ -83,6 +84,7 @@ def test_gears_rattle_beside_the_closed_mesh():
     assert low < onset < high
 
 
+@pytest.mark.slow
 def test_a_clutch_judders_below_its_hopf_point():
     clutch = gallery.Clutch(omega=2.0)
     branch = nsjax.continue_equilibrium(clutch, clutch.state({"theta": 0.1}), "omega", (1.0, 3.0))
@@ -94,6 +96,7 @@ def test_a_clutch_judders_below_its_hopf_point():
     assert not branch.stable[0] and branch.stable[-1]
 
 
+@pytest.mark.slow
 def test_a_buck_converter_flips():
     """A multiplier of its orbit is -1 where matrix exponentials say so; 24.516 is in the literature."""
     voltage = flip_of_the_buck_converter()

@@ -211,6 +211,7 @@ def test_a_stop_that_is_at_rest_at_the_start():
     np.testing.assert_allclose(sol.y1.v.x, 2 - 0.1 * 2 * 9.81 * 0.5, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_bouncing_ball_on_a_floor_with_friction():
     """At an impact the tangential impulse is μ times the normal one: v_x falls by μ (1 + e) v_z."""
     scene = Scene(

@@ -1,6 +1,5 @@
 """`find_orbit` where all numbers are known: Python calls one program, and finds what the traced search finds."""
 
-import contextlib
 import dataclasses
 
 import diffrax
@@ -9,27 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from models import Motion
+from programs import compilations
 
 import nsjax
 from nsjax import find_orbit, gallery
 from nsjax.orbits._passage import passage
 from nsjax.plot._path import once_round
-
-
-@contextlib.contextmanager
-def compilations():
-    """Of which programs are compiled: a list of seconds."""
-    compiled = []
-
-    def heard(event, seconds, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(seconds)
-
-    jax.monitoring.register_event_duration_secs_listener(heard)
-    try:
-        yield compiled
-    finally:
-        jax.monitoring.unregister_event_duration_listener(heard)
 
 
 def test_a_new_number_is_no_new_program():

@@ -365,6 +365,7 @@ def test_fit_by_optimistix():
     np.testing.assert_allclose(found.value, true, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_derivative_where_there_is_no_orbit():
     """Pitfall 17: one lane of a batch has none, and there the derivative is not a number."""
 

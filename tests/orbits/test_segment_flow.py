@@ -17,6 +17,7 @@ from nsjax.orbits.segments._equations import OrbitCurve
 from nsjax.orbits.segments._segment_flow import ALWAYS, exactness, FREE_MODES, NEVER, SegmentFlow
 from nsjax.system._mode import ModeState
 from nsjax.system._model import SwitchedSystem
+from nsjax.system._parameter import FreeParameters
 from nsjax.system._system import arrays_of
 
 
@@ -42,11 +43,11 @@ class Driven(nsjax.System):
 def flow_of(system, exact, slides=True):
     system = arrays_of(system, jnp.float64)
     model = SwitchedSystem.forwards(system, jnp.zeros(()), Y)
-    return SegmentFlow(model, Y, HOW, exact, slides)
+    return SegmentFlow(model, FreeParameters.of(system, ("omega",)), system.omega, Y, HOW, exact, slides)
 
 
 def at(flow, omega):
-    return dataclasses.replace(flow, model=flow.model.with_parameter(("omega",), omega))
+    return dataclasses.replace(flow, value=omega)
 
 
 def test_which_modes():
@@ -126,13 +127,19 @@ class Decay(nsjax.System):
 
 @pytest.mark.parametrize("exact", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_tangents_of_the_model(exact):
-    """The derivative by a parameter is a tangent of the model, and no column is carried for what has none."""
+    """By free parameters, or by arrays of the model; no column is carried for what has no tangent."""
     y, t = jnp.array([1.3]), jnp.asarray(2.0)
     model = SwitchedSystem.forwards(arrays_of(Decay(), jnp.float64), t, y)
+    both = FreeParameters.of(model.system, ("k",), ("c",))
 
-    def end(p, x=y):
-        flow = SegmentFlow(model.with_parameter((("k",), ("c",)), p), y, HOW, exact, False)
+    def end(p, x=y, free=both):
+        flow = SegmentFlow(model, free, p, y, HOW, exact, False)
         return flow.arrive(jnp.zeros(()), t, x, ModeState((), (), ()))[0]
+
+    def by_arrays(p):
+        system = dataclasses.replace(model.system, k=p[0], c=p[1])
+        flow = SegmentFlow(model.with_system(system), FreeParameters.of(system), jnp.zeros(0), y, HOW, exact, False)
+        return flow.arrive(jnp.zeros(()), t, y, ModeState((), (), ()))[0]
 
     def closed(p):
         return y[0] * jnp.exp(-p[0] * t) + p[1] / p[0] * (1 - jnp.exp(-p[0] * t))
@@ -141,6 +148,10 @@ def test_tangents_of_the_model(exact):
     np.testing.assert_allclose(end(p), closed(p), atol=1e-11)
     np.testing.assert_allclose(jax.jacfwd(end)(p), jax.jacfwd(closed)(p), atol=1e-10)
     np.testing.assert_allclose(jax.hessian(closed)(p), jax.jacfwd(jax.jacfwd(end))(p), atol=1e-8)
+    np.testing.assert_allclose(jax.jacfwd(by_arrays)(p), jax.jacfwd(closed)(p), atol=1e-10)
+    # Which ones are free may be known to the program only when it runs.
+    chosen = jax.jit(lambda p, free: jax.jacfwd(lambda p: end(p, free=free))(p))
+    np.testing.assert_allclose(chosen(p, both), jax.jacfwd(closed)(p), atol=1e-10)
     step = 1e-5 * np.eye(2)
     differences = [(end(p + h) - end(p - h)) / 2e-5 for h in step]
     np.testing.assert_allclose(jax.jacfwd(end)(p), differences, atol=1e-8)
@@ -148,13 +159,10 @@ def test_tangents_of_the_model(exact):
     if not exact:
         assert _columns(end, p) == 3
         assert _columns(lambda x: end(p, x), y) == 1
-        one = model.with_parameter(("k",), p[0])
-
-        def by_c(c):
-            flow = SegmentFlow(one.with_parameter(("c",), c), y, HOW, exact, False)
-            return flow.arrive(jnp.zeros(()), t, y, ModeState((), (), ()))
-
-        assert _columns(by_c, p[1]) == 2
+        assert _columns(by_arrays, p) == 3
+        by_c = FreeParameters.of(model.system, ("c",))
+        for free in (by_c, by_c.fixed):
+            assert _columns(lambda c, free=free: end(c, free=free), p[1]) == 2
 
 
 def _columns(fn, x):

@@ -258,6 +258,7 @@ def test_perturbation_tube():
     np.testing.assert_allclose(polygons[on_belt][..., 1], 0.5, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_perturbation_tube_takes_axes_and_components():
     ax = plt.figure().add_subplot()
     given = plot.perturbation_tube(stable(), "v", "x", ellipses=5, samples=50, ax=ax, legend=False, surfaces=False)

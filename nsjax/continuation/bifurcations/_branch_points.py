@@ -10,12 +10,9 @@ a critical value at single values of a further parameter else.
 import dataclasses
 from typing import Any
 
-import jax
 import numpy as np
-from jaxtyping import Array
 
-from ..._numerics._compile import interactive
-from ...orbits.segments._equations import OrbitCurve, row_sizes
+from ...orbits.segments._equations import equations, OrbitCurve
 from ...orbits.segments._itinerary import OrbitItinerary
 from ..orbits._test_functions import of_circle, of_corners, Test
 from ..orbits._tracer import OrbitPoint
@@ -24,16 +21,6 @@ from ._surface import AbstractBifurcationTracer, DELTA, interval_tests, Place, s
 
 ISOLATED = 1e-2  # curvature of β along the curve, over that across it: zero where there is a curve
 EXACT = 1e-11
-
-
-@interactive
-def _equations(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, origin: Array) -> tuple[Array, Array]:
-    def residual(u: Array) -> tuple[Array, Array]:
-        f = curve.residual(u, itinerary, origin)[0]
-        return f, f
-
-    df, f = jax.jacfwd(residual, has_aux=True)(u)
-    return f, df
 
 
 @dataclasses.dataclass
@@ -49,8 +36,7 @@ class _Frame:
 
     @classmethod
     def at(cls, curve: OrbitCurve, itinerary: OrbitItinerary, u: np.ndarray) -> "_Frame":
-        _, df = map(np.asarray, _equations(curve, itinerary, u, u))
-        sizes = np.asarray(row_sizes(df))
+        _, df, sizes = equations(curve, itinerary, u, u)
         left, _, right = np.linalg.svd(df / sizes[:, None])
         return cls(curve, itinerary, u, sizes, left[:, -1], right[-3:])
 
@@ -59,7 +45,7 @@ class _Frame:
         n, u, beta = len(guess), guess, 0.0
         zeros = np.zeros((3, 1))
         for _ in range(12):
-            f, df = map(np.asarray, _equations(self.curve, self.itinerary, u, self.u))
+            f, df, _ = equations(self.curve, self.itinerary, u, self.u)
             rest = np.concatenate([f / self.sizes + beta * self.missing, self.plane @ (u - self.u) - s])
             whole = np.block([[df / self.sizes[:, None], self.missing[:, None]], [self.plane, zeros]])
             inverse = np.linalg.inv(whole)

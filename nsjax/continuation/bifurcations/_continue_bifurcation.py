@@ -221,7 +221,7 @@ def _checked(
     curve = origin.curve
     system = curve.model.system
     path = parameter_path(system, parameter)
-    if path == curve.path:
+    if path in curve.free.paths:
         raise ValueError(f"Argument `parameter` must be another one than that of the branch, `{parameter}`.")
     if first is None:
         first = float(curve.low), float(curve.low + curve.width)

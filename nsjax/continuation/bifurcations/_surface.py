@@ -17,7 +17,7 @@ from ...orbits.segments._equations import linearised, OrbitCurve
 from ...orbits.segments._guard_minima import along_segment, zeros_at_begin
 from ...orbits.segments._itinerary import capacity_for, EVENT, GRAZING, OrbitItinerary, Start
 from ...orbits.segments._point import correct, PointData
-from ...system._parameter import get_parameter
+from ...system._parameter import FreeParameters, get_parameter
 from ..orbits._bifurcation import Origin
 from ..orbits._test_functions import branch_value, CIRCLE, CORNERS, of_circle, of_corners, Test
 from ..orbits._tracer import OrbitPoint, spot_of
@@ -60,9 +60,9 @@ def lift(
 ) -> tuple[OrbitCurve, OrbitPoint, Test]:
     """A special point of a branch as one of the surface over its parameter and another one, in these intervals."""
     test, spot, curve = untouched(origin)
-    first: Any = curve.path
     other = float(get_parameter(curve.model.system, path))
-    surface = dataclasses.replace(curve, path=(first, path), low=low, width=high - low)
+    both = FreeParameters.of(curve.model.system, *curve.free.paths, path)
+    surface = dataclasses.replace(curve, free=both, low=low, width=high - low)
     parameters = (np.array([spot.parameter, other]) - low) / (high - low)
     u = np.append(spot.look.u[:-1], parameters)
     tangent = np.append(spot.look.tangent[:-1], [spot.look.tangent[-1] * float(curve.width) / (high - low)[0], 0.0])
@@ -95,7 +95,7 @@ def untouched(origin: Origin) -> Origin:
     shorter = itinerary._replace(ends=ends).take(kept, capacity_for(len(kept)))
     start = Start(shorter, look.begin[kept], look.end[kept], xs[kept])
     u = curve.pack(start, spot.parameter)
-    border = np.linalg.svd(np.asarray(linearised(curve, shorter, u)))[2][-1]
+    border = np.linalg.svd(linearised(curve, shorter, u))[2][-1]
     found = correct(curve, shorter, Plane(u, border))
     if not bool(found.good):
         return origin

@@ -148,7 +148,7 @@ def _cut(locus: BifurcationTracer, spot: OrbitPoint, test: Test) -> OrbitPoint |
     if own.kind in (*CORNERS, "grazing") and row <= own.row:
         own = own._replace(row=own.row + 1)
     u = locus.curve.pack(start, spot.look.parameter)
-    border = np.linalg.svd(np.asarray(linearised(locus.curve, start.itinerary, u)))[2][-2:]
+    border = np.linalg.svd(linearised(locus.curve, start.itinerary, u))[2][-2:]
     try:
         first, second = (dataclasses.replace(locus, test=t) for t in (own, Test("grazing", row)))
         rough = seen_at(locus.curve, start.itinerary, u, border)

@@ -93,7 +93,7 @@ class EquilibriumContinuation(AbstractContinuation[EquilibriumPoint, Branch]):
         **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model.
         """
         archive = Archive(path, "EquilibriumContinuation", cls._types, system, y)
-        return cls._loaded(archive, progress, {}, {})
+        return cls._loaded(archive, progress, lambda path: dict(path=path), {})
 
 
 @lambda fn: with_arguments_of(EquilibriumContinuation, fn, Branch)

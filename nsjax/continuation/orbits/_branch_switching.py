@@ -79,7 +79,7 @@ def tracer_for(tracer: OrbitTracer, curve: OrbitCurve) -> OrbitTracer:
 
 
 def _kernel(tracer: OrbitTracer, itinerary: OrbitItinerary, u: Any) -> np.ndarray:
-    return np.linalg.svd(np.asarray(linearised(tracer.curve, itinerary, u)))[2][-2:]
+    return np.linalg.svd(linearised(tracer.curve, itinerary, u))[2][-2:]
 
 
 def set_out(tracer: OrbitTracer, itinerary: OrbitItinerary, u: Any, direction: np.ndarray) -> OrbitPoint | None:

@@ -14,7 +14,7 @@ from ...orbits._orbit import Orbit
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import OrbitItinerary
 from ...orbits.segments._point import PointData
-from ...system._parameter import get_parameter
+from ...system._parameter import FreeParameters, Path
 from ...system._system import System
 from .._archive import Archive, plain
 from .._continuation import AbstractContinuation, growth_types, with_arguments_of
@@ -88,7 +88,7 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
     ):
         integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
         curve, start = curve_and_start(system, orbit, parameter, interval, scale, integrator)
-        start, value = start.filled(), get_parameter(curve.model.system, curve.path)
+        start, value = start.filled(), curve.value
         tracer = OrbitTracer(curve, max_step, max_points)
         spot = tracer.orbit_near(start.itinerary, curve.pack(start, value))
         if spot is None:
@@ -142,7 +142,11 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
                 "Argument `record` must hold functions of the names with which the branch was begun, "
                 f"{archive.part('record')}, but has {sorted(recorder.measures)}."
             )
-        growth = cls._loaded(archive, progress, dict(integrator=integrator), dict(recorder=recorder))
+
+        def for_curve(path: Path) -> dict[str, Any]:
+            return dict(free=FreeParameters.of(archive.system, path), integrator=integrator)
+
+        growth = cls._loaded(archive, progress, for_curve, dict(recorder=recorder))
         for name, value in growth._tree.branches[0][1].points[0].record.items():
             recorder.shapes[name] = value.shape
         return growth

@@ -14,7 +14,7 @@ from ...orbits.segments._equations import field_at, guard_sizes, OrbitCurve
 from ...orbits.segments._itinerary import Start, starts_of
 from ...orbits.segments._segment_flow import exactness, fits, NEVER, SegmentFlow, states_along
 from ...system._model import SwitchedSystem
-from ...system._parameter import get_parameter, parameter_path
+from ...system._parameter import FreeParameters, get_parameter, parameter_path
 from ...system._system import arrays_of, System
 from .._checks import check_interval, check_precision, checked_scale
 
@@ -40,7 +40,7 @@ def curve_and_start(
     n = len(start.x[0])
     curve = OrbitCurve(
         model=model,
-        path=path,
+        free=FreeParameters.of(system, path),
         like=orbit.y0,
         low=np.asarray(low),
         width=np.asarray(high - low),
@@ -71,7 +71,7 @@ def _segments(curve: OrbitCurve, start: Start, value: float) -> tuple[SegmentFlo
     itinerary = start.itinerary
     states = [curve.state(itinerary.mode[i], itinerary.part[i]) for i in itinerary.rows]
     rows = zip(start.begin, start.end, start.x, states)
-    return curve.on(itinerary).flow(curve.model_at(np.asarray(value))), list(rows)
+    return curve.on(itinerary).flow(jnp.asarray(value)), list(rows)
 
 
 def _exact(curve: OrbitCurve, start: Start, value: float) -> int:
@@ -101,5 +101,5 @@ def phase_of(curve: OrbitCurve, start: Start) -> tuple[np.ndarray, np.ndarray]:
     if not curve.autonomous:
         return np.zeros_like(x), x
     at = np.asarray(start.begin[0]), x, start.itinerary.mode[0], start.itinerary.part[0]
-    f = np.asarray(field_at(curve, jnp.asarray(get_parameter(curve.model.system, curve.path)), *at))
+    f = np.asarray(field_at(curve, jnp.asarray(curve.value), *at))
     return f / np.maximum(f @ f, 1e-300), x

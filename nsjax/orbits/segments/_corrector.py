@@ -50,6 +50,7 @@ class Turn(NamedTuple):
     ended: Bool[Array, ""]  # whether `next` is where it ends
     good: Bool[Array, ""]
     over: Bool[Array, ""]  # whether u is
+    spoilt: Bool[Array, ""]  # whether derivatives were none on the way
     count: Array
 
 
@@ -70,14 +71,15 @@ def newton_turns(
         off = jnp.append(linear.f, border @ (u - origin) - distance)
         step = method.step(u, off, jnp.concatenate([linear.df, jnp.atleast_2d(border)]))
         new, ended, good = (jnp.where(c.ended, old, now) for old, now in zip((u, True, c.good), step))
-        return Turn(u, new, linear, ended, good, over=c.ended, count=c.count + 1)
+        spoilt = c.spoilt | curve.spoilt(linear.f, linear.df)
+        return Turn(u, new, linear, ended, good, over=c.ended, spoilt=spoilt, count=c.count + 1)
 
     # The last turn has the derivatives at the root, which all that is seen of it begins with: so the equations stand
     # in the program once.
     size, rows, n = len(guess), len(itinerary.slot), len(curve.sizes)
     blank = Linear(*(jnp.zeros(shape, guess.dtype) for shape in ((size - m,), (rows, n), (size - m, size), (size,))))
-    no = jnp.zeros((), bool)
-    first = Turn(guess, guess, blank, ended=~jnp.asarray(newton), good=no, over=no, count=jnp.zeros((), jnp.int32))
+    ended, no, none = ~jnp.asarray(newton), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
+    first = Turn(guess, guess, blank, ended, good=no, over=no, spoilt=no, count=none)
     return lax.while_loop(lambda c: ~c.over & (c.count <= method.max_iterations), turn, first)
 
 

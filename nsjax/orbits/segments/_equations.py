@@ -5,6 +5,7 @@ segment has no length, and on surfaces that repel.
 """
 
 import dataclasses
+import functools as ft
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +21,7 @@ from ...flow._integrator import Integrator
 from ...system._impact import impact
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
-from ...system._parameter import Path
+from ...system._parameter import FreeParameters, get_parameter
 from ._guess import landing
 from ._itinerary import EVENT, GRAZING, OrbitItinerary, PIECE, REPELLING_EXIT, Start, TIME
 from ._segment_flow import ALWAYS, FREE_MODES, SegmentFlow
@@ -33,14 +34,14 @@ class OrbitCurve(eqx.Module):
     """The equations; what is unknown is measured in `sizes` (state), `time`, and `width`, the interval of the parameter
     from `low` on.
 
-    With several parameters (`path` holds their paths, and `low` and `width` are vectors) their orbits are a surface;
-    with none (all three are empty) an orbit is a point.
+    With several free parameters (`low` and `width` are vectors) their orbits are a surface; with none (both are empty)
+    an orbit is a point.
 
     `pieces`: into how many of equal length each segment is divided, for multiple shooting. Each has a row of its own.
     """
 
     model: SwitchedSystem
-    path: Path = eqx.field(static=True)
+    free: FreeParameters
     like: Y
     low: Float[Array, "*parameters"]
     width: Float[Array, "*parameters"]
@@ -60,14 +61,31 @@ class OrbitCurve(eqx.Module):
         slides = self.model.holds(*np.asarray(itinerary.mode)[: int(itinerary.num)])
         return self if slides == self.slides else dataclasses.replace(self, slides=slides)
 
+    @property
+    def value(self) -> Array:
+        """Of the free parameter in the model."""
+        (path,) = self.free.paths
+        return get_parameter(self.model.system, path)
+
+    @property
+    def fixed(self) -> "OrbitCurve":
+        """The same for programs of this free parameter only. In others every parameter has a derivative, which may be
+        infinite (of √c at c = 0, of |x|^n by n at x = 0), and zero times it, if the parameter is not free, is NaN."""
+        return dataclasses.replace(self, free=self.free.fixed)
+
+    def spoilt(self, f: Array, df: Array) -> Array:
+        """Whether equations or derivatives are not finite, and `fixed` may be of help: where the solver integrates both
+        at once, the state is lost too."""
+        return ~(jnp.all(jnp.isfinite(f)) & jnp.all(jnp.isfinite(df)))
+
     def model_at(self, value: Array) -> SwitchedSystem:
         """The model with a value of the parameter (or of several)."""
-        return self.model.with_parameter(self.path, value) if self.path else self.model
+        return self.model.with_system(self.free.put(self.model.system, value))
 
-    def flow(self, model: SwitchedSystem) -> SegmentFlow:
-        """That of the modes of `model_at` some value."""
+    def flow(self, value: Array) -> SegmentFlow:
+        """That of the modes with a value of the parameter (or of several)."""
         exact = self.exact == ALWAYS or (self.exact == FREE_MODES and not self.slides)
-        return SegmentFlow(model, self.like, self.integrator, exact, self.slides)
+        return SegmentFlow(self.model, self.free, value, self.like, self.integrator, exact, self.slides)
 
     @property
     def autonomous(self) -> bool:
@@ -137,7 +155,7 @@ class OrbitCurve(eqx.Module):
         given, rows = (begin, end), len(begin)
         begin, end = self.spread(begin, end)
         model = self.model_at(value)
-        flow = self.flow(model)
+        flow = self.flow(value)
         index = jnp.arange(rows, dtype=itinerary.num.dtype)
         happened, final = index < itinerary.num, index == itinerary.num - 1
         mode, part = jnp.asarray(itinerary.mode), jnp.asarray(itinerary.part)
@@ -267,12 +285,25 @@ def guards_along(
     return values, rates, bends
 
 
-def linearised(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> Array:
+def linearised(curve: OrbitCurve, itinerary: OrbitItinerary, u: Any) -> Float[np.ndarray, "rows unknowns"]:
     """The derivatives of the equations, row by row of size one."""
-    return _linearised(curve.on(itinerary), itinerary, u)
+    _, df, sizes = equations(curve.on(itinerary), itinerary, u, u)
+    return df / sizes[:, None]
 
 
-@interactive
-def _linearised(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> Array:
-    df = jax.jacfwd(lambda v: curve.residual(v, itinerary, u)[0])(u)
-    return df / row_sizes(df)[:, None]
+def equations(curve: OrbitCurve, itinerary: OrbitItinerary, u: Any, origin: Any) -> tuple[Any, Any, Any]:
+    """The equations, their derivatives, and the sizes of these, row by row."""
+    f, df, sizes, spoilt = _equations(curve, itinerary, u, origin)
+    if spoilt:
+        f, df, sizes, _ = _equations(curve.fixed, itinerary, u, origin)
+    return f, df, sizes
+
+
+@ft.partial(interactive, host=True)
+def _equations(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, origin: Array) -> tuple[Array, ...]:
+    def residual(u: Array) -> tuple[Array, Array]:
+        f = curve.residual(u, itinerary, origin)[0]
+        return f, f
+
+    df, f = jax.jacfwd(residual, has_aux=True)(u)
+    return f, df, row_sizes(df), curve.spoilt(f, df)

@@ -46,7 +46,7 @@ def along_segment(curve: OrbitCurve, value: Array, segment: tuple, orders: Array
     """As `along_orbit`, of one segment: its two times, first state, mode and parts; with any orders of the zeros."""
     a, b, x, mode, part = segment
     model = curve.model_at(value)
-    flow = curve.flow(model)
+    flow = curve.flow(value)
     n, state = len(curve.sizes), curve.state(mode, part)
     slots = orders.shape[1] - 2 * n
     slack = jnp.concatenate(

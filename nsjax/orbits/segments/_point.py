@@ -14,7 +14,7 @@ from ..._numerics._root import Newton
 from ..._types import Scalar
 from ...derivatives._floquet import floquet, structural_zeros
 from ...system._model import SwitchedSystem
-from ._corrector import Linear, newton_turns, Plane
+from ._corrector import newton_turns, Plane, Turn
 from ._equations import OrbitCurve, row_sizes
 from ._guard_minima import along_orbit
 from ._itinerary import EVENT, OrbitItinerary, REPELLING_EXIT, TIME
@@ -81,7 +81,7 @@ def state_at(curve: OrbitCurve, itinerary: OrbitItinerary, look: PointData, i: i
     """The state at a time in segment i. (Between steps the states of a `PointData` are those of the solver's dense
     output, less exact than the steps.)"""
     state = curve.state(itinerary.mode[i], itinerary.part[i])
-    flow = curve.on(itinerary).flow(curve.model_at(look.parameter))
+    flow = curve.on(itinerary).flow(jnp.asarray(look.parameter))
     return np.asarray(states_along(flow, look.begin[i], np.asarray(t), look.x[i], state))[-1]
 
 
@@ -92,12 +92,18 @@ def correct(
     default straight ahead), and all that is seen of it; or, without `newton`, of the guess itself."""
     plane = plane.filled()
     guess = plane.origin + np.dot(plane.distance, plane.normal) if guess is None else guess
-    return _correct(curve.on(itinerary), itinerary, plane, guess, np.asarray(newton))
+    curve, looks = curve.on(itinerary), np.asarray(newton)
+    found, spoilt = _correct(curve, itinerary, plane, guess, looks)
+    return _correct(curve.fixed, itinerary, plane, guess, looks)[0] if spoilt else found
 
 
 @ft.partial(interactive, often=True)
-def _correct(curve: OrbitCurve, itinerary: OrbitItinerary, plane: Plane, guess: Array, newton: Array) -> PointData:
-    return corrected(curve, itinerary, plane, guess, newton)
+def _correct(
+    curve: OrbitCurve, itinerary: OrbitItinerary, plane: Plane, guess: Array, newton: Array
+) -> tuple[PointData, Bool[Array, ""]]:
+    """Also whether a parameter that does not vary spoils it, see `OrbitCurve.fixed`."""
+    last = newton_turns(curve, itinerary, plane, guess, Newton(TOLERANCE, 10), newton)
+    return _seen(curve, itinerary, last, plane, turns=True), last.spoilt
 
 
 def corrected(
@@ -110,13 +116,12 @@ def corrected(
 ) -> PointData:
     """`correct`, within a program; without `turns` the largest and least states are those at the nodes."""
     last = newton_turns(curve, itinerary, plane, guess, Newton(TOLERANCE, 10), newton)
-    return _seen(curve, itinerary, last.u, last.linear, last.good, plane, turns)
+    return _seen(curve, itinerary, last, plane, turns)
 
 
-def _seen(
-    curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, linear: Linear, good: Array, plane: Plane, turns: bool
-) -> PointData:
-    """All that is seen of a point."""
+def _seen(curve: OrbitCurve, itinerary: OrbitItinerary, turn: Turn, plane: Plane, turns: bool) -> PointData:
+    """All that is seen of a point, at which Newton's method has ended."""
+    u, linear, good = turn.u, turn.linear, turn.good
     begin, end, x, value = curve.parts(u)
     n, rows, m = len(curve.sizes), len(begin), curve.dimension
     model = curve.model_at(value)

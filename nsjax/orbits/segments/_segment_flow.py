@@ -26,6 +26,7 @@ from ...flow._solve import integrate
 from ...flow.steppers._exponential import affine_parts, expm, generator
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
+from ...system._parameter import FreeParameters
 
 
 TRUSTED = 1e2  # dense output may err by this many tolerances of the steps
@@ -33,13 +34,20 @@ NEVER, FREE_MODES, ALWAYS = range(3)  # when a mode's flow is known by its expon
 
 
 class SegmentFlow(eqx.Module):
-    """The flow of each mode of a model. A derivative by a parameter is one by the model, whose arrays have tangents."""
+    """The flow of each mode of a model, for a value of its free parameter (or of several). Derivatives are those by the
+    value, and by arrays of the model."""
 
-    model: SwitchedSystem
+    base: SwitchedSystem
+    free: FreeParameters
+    value: Array
     like: Y
     integrator: Integrator = eqx.field(static=True)
     exact: bool = eqx.field(static=True)
     slides: bool = eqx.field(static=True)  # whether modes that are held occur
+
+    @property
+    def model(self) -> SwitchedSystem:
+        return self.base.with_system(self.free.put(self.base.system, self.value))
 
     @property
     def missed(self) -> float:
@@ -177,8 +185,9 @@ def _arrive_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     flow, a, b, x, state = primals
     dflow, da, db, dx, _ = tangents
     # None where an array is not perturbed: it has no columns in the variational equation. (`like` is structure only.)
-    dmodel = jax.tree.leaves(dflow.model)
-    end, by_x, by_model = _varied(flow, dflow.model, a, b, x, state)
+    perturbed = dflow.base, dflow.value
+    dmodel = jax.tree.leaves(perturbed)
+    end, by_x, by_model = _varied(flow, perturbed, a, b, x, state)
     out = jnp.zeros_like(x)
     if db is not None:
         out = out + flow.field(b, end, state) * db
@@ -195,16 +204,20 @@ def _varied(
     flow: SegmentFlow, perturbed: Any, a: Scalar, b: Scalar, x: Array, state: ModeState
 ) -> tuple[Array, Float[Array, "n n"], Float[Array, "n arrays"]]:
     """The state at the end, and its derivatives by that at the beginning, and by the numbers in those arrays of the
-    model that are `perturbed`."""
+    model, and values of parameters, that are `perturbed`."""
     mask = jax.tree.map(lambda d: d is not None, perturbed, is_leaf=lambda d: d is None)
-    changed, still = eqx.partition(flow.model, mask)
+    changed, still = eqx.partition((flow.base, flow.value), mask)
     values, unravel = jfu.ravel_pytree(changed)
     n, m = len(x), values.size
+
+    def at(values: Array) -> SegmentFlow:
+        base, value = eqx.combine(unravel(values), still)
+        return dataclasses.replace(flow, base=base, value=value)
+
     if flow.exact:
 
         def end(values: Array) -> tuple[Array, tuple[Array, Array]]:
-            moved = dataclasses.replace(flow, model=eqx.combine(unravel(values), still))
-            end, by_x = _exponential(moved, a, b, x, state)
+            end, by_x = _exponential(at(values), a, b, x, state)
             return end, (end, by_x)
 
         if not m:
@@ -212,7 +225,11 @@ def _varied(
         by_model, (out, by_x) = jax.jacfwd(end, has_aux=True)(values)
         return out, by_x, by_model
     eye = jnp.eye(n + m, dtype=x.dtype)
-    moved = jax.vmap(unravel)(eye[:, n:].astype(values.dtype)) if m else None
+    moved = None
+    if m:
+        depends = jax.tree.map(lambda new, old: new is not old, at(values).model, flow.base)
+        numbers = jax.linearize(lambda values: eqx.filter(at(values).model, depends), values)[1]
+        moved = jax.vmap(numbers)(eye[:, n:].astype(values.dtype))
     columns = jax.vmap(flow.unravel)(eye[:, :n])
     sol = integrate(VariedModeFlow(flow.model, state, moved), a, b, (flow.unravel(x), columns), flow.integrator)
     y, along = sol.y1

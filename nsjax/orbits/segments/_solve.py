@@ -23,6 +23,7 @@ from ...flow._results import is_okay, RESULTS
 from ...flow._solution import Events
 from ...flow.events._locate import cosine
 from ...system._model import SwitchedSystem
+from ...system._parameter import FreeParameters
 from ...system._system import System
 from .._orbit import fractions, judge, Orbit, ravel
 from ._arcs import Arcs
@@ -112,7 +113,7 @@ def _problem(
     rows, still = guess.itinerary, frozen(model)
     blank = OrbitCurve(
         model=model,
-        path=(),
+        free=FreeParameters.of(system),
         like=y0,
         low=none,
         width=none,
@@ -133,7 +134,7 @@ def _problem(
     curve = dataclasses.replace(blank, normal=normal, guard_sizes=sizes)
     if pieces == 1:
         return curve, rows, jnp.concatenate([guess.begin[:, None], guess.end[:, None], x], axis=1).ravel()
-    flow, shares = curve.flow(still), jnp.arange(pieces, dtype=t0.dtype) / pieces
+    flow, shares = dataclasses.replace(curve, model=still).flow(none), jnp.arange(pieces, dtype=t0.dtype) / pieces
 
     def cut(a: Scalar, b: Scalar, x: Array, mode: Array, part: Array) -> Array:
         starts = a + (b - a) * shares

@@ -152,7 +152,7 @@ def continue_orbits(
     own = [i for i, one in enumerate(good) if one]
     starts = dict(zip(own, starts_of(curve.model, [each[i] for i in own])))
     # One program for all: with the flows of modes that surfaces hold, if there are any.
-    curve = dataclasses.replace(curve, slides=any(curve.on(start.itinerary).slides for start in starts.values()))
+    curve = dataclasses.replace(curve.fixed, slides=any(curve.on(start.itinerary).slides for start in starts.values()))
     capacity = capacity_for(max(int(start.itinerary.num) for start in starts.values()))
     rows = [_lane_of(curve, each[i], starts[i], capacity) for i in (j if good[j] else first for j in range(len(each)))]
     lanes = jax.tree.map(lambda *xs: np.stack(xs), *rows)
@@ -184,7 +184,7 @@ def _lane_of(curve: OrbitCurve, orbit: Orbit, start: Start, capacity: int) -> _L
     own = dataclasses.replace(curve, model=curve.model.with_system(system))
     normal, reference = phase_of(own, start)
     start = start._replace(itinerary=start.itinerary.take(list(start.itinerary.rows), capacity))
-    u = curve.pack(start, get_parameter(system, curve.path))
+    u = curve.pack(start, own.value)
     order, system = order_of(system, orbit), jax.tree.map(np.asarray, system)
     return _Lane(system, order, normal, reference, start.itinerary, u)
 

@@ -263,7 +263,7 @@ def repelled_at(tracer: OrbitTracer, name: str, spot: OrbitPoint, rows: list[int
     ends[after] = REPELLING_EXIT
     halves = []
     for itinerary in (spot.itinerary, spot.itinerary._replace(ends=ends)):
-        kernel = np.linalg.svd(np.asarray(linearised(curve, itinerary, spot.look.u)))[2][-1]
+        kernel = np.linalg.svd(linearised(curve, itinerary, spot.look.u))[2][-1]
         for sign in (1, -1):
             born = set_out(tracer, itinerary, spot.look.u, sign * kernel)
             if born is not None:
@@ -284,7 +284,7 @@ def held_beyond(curve: OrbitCurve, spot: OrbitPoint, side: int) -> bool:
         return False
     t, x, _ = midpoint(curve, spot, held)
     value = np.asarray(spot.parameter - side * BEYOND * float(curve.width))
-    system = curve.model.with_parameter(curve.path, value).system
+    system = curve.model_at(value).system
     period = np.asarray(float(system.period) * int(curve.order))
     y, integrator = curve.unravel(x), curve.integrator._replace(max_events=MAX_EVENTS)
     return repeats_held(system, np.asarray(t), y, period, None, integrator)

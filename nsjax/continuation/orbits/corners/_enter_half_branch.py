@@ -101,7 +101,7 @@ def _predicted(curve: OrbitCurve, spot: OrbitPoint, points: list[Base], cycle: C
     _, _, events, good = follow(curve, x, np.full(count, value), spot.look.parameter, begin, end, modes)
     if not np.all(good):
         return None
-    here, there = (curve.model.with_parameter(curve.path, jnp.asarray(v)).system for v in (spot.parameter, value))
+    here, there = (curve.model_at(jnp.asarray(v)).system for v in (spot.parameter, value))
     slow = 1.0 if curve.autonomous else float(there.period) / float(here.period)
     diaries = []
     for lane in range(count):

@@ -63,7 +63,7 @@ def follow(curve: OrbitCurve, xs: Any, values: Any, reference: Any, begin: Any, 
     model, integrator = curve.model, with_room(curve.integrator._replace(max_events=MAX_EVENTS), np.float64)
     directions = Directions.of_state(model.system, np.zeros(()), curve.like)
     last = np.eye(len(curve.sizes) + 1)[-1]  # the parameter
-    directions = directions._replace(system=put_parameter(directions.system, curve.path, last))
+    directions = directions._replace(system=put_parameter(directions.system, curve.free.paths[0], last))
     rows = []
     for x, value, a, b, mode in zip(xs, values, begin, end, modes):
         slow, slower = (1.0, 0.0) if curve.autonomous else jax.device_get(_slowed(curve, value, np.asarray(reference)))
@@ -71,7 +71,7 @@ def follow(curve: OrbitCurve, xs: Any, values: Any, reference: Any, begin: Any, 
         given = (
             {k.name: m for k, m in zip(model.switches, mode)} if model.holds(mode) else of_relays(model.system, mode)
         )
-        system = put_parameter(model.system, curve.path, np.asarray(value))
+        system = curve.model_at(np.asarray(value)).system
         times = np.asarray(a * slow), np.asarray(b * slow)
         sol, tangents = flow_map(system, *times, curve.unravel(x), given, integrator, way)
         y1 = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(sol.y1)])
@@ -84,7 +84,7 @@ def _slowed(curve: OrbitCurve, value: Any, reference: Any) -> tuple[jax.Array, j
     """The period of the forcing over that at the value `reference` of the parameter, and its derivative."""
 
     def period(value: jax.Array) -> jax.Array:
-        return jnp.asarray(put_parameter(curve.model.system, curve.path, value).period, curve.sizes.dtype)
+        return jnp.asarray(curve.model_at(value).system.period, curve.sizes.dtype)
 
     now, change = jax.jvp(period, (value,), (jnp.ones_like(value),))
     return now / period(reference), change / period(reference)

@@ -1,0 +1,60 @@
+"""One program follows the orbits of a model, whichever of its parameters vary: see test_continue_bifurcation."""
+
+import jax.numpy as jnp
+import numpy as np
+from branches import continue_orbit, orbit_of
+from models import Duffing, Motion
+
+import nsjax
+from nsjax.orbits.segments import _point
+from nsjax.system._parameter import FreeParameters
+
+
+class Power(nsjax.System):
+    """`Duffing` with any power of x. Its derivative by n, x^n log x, is not a number where x < 0."""
+
+    n: float = 3.0
+    c: float = 0.2
+    F: float = 1.0
+    omega: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, self.F * jnp.cos(self.omega * t) - self.c * y.v - y.x - y.x**self.n)
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
+START = Motion(0.5, 0.5)
+
+
+def test_a_parameter_that_is_not_free_may_have_no_derivative(monkeypatch):
+    """Zero times an infinite derivative, or one that is NaN, is no part of an answer: another program finds it."""
+    fixed = []
+    program = _point._correct
+
+    def heard(curve, *args):
+        fixed.append(isinstance(curve.free.free, tuple))
+        return program(curve, *args)
+
+    monkeypatch.setattr(_point, "_correct", heard)
+    branches = []
+    for system in (Duffing(), Power()):
+        fixed.clear()
+        branches.append(continue_orbit(system, orbit_of(system, START), "omega", (0.9, 1.1), max_step=0.1))
+        assert any(fixed) == isinstance(system, Power)
+    plain, power = branches
+    np.testing.assert_allclose(power.values, plain.values, rtol=1e-9)
+    np.testing.assert_allclose(power.multipliers, plain.multipliers, rtol=1e-7)
+    np.testing.assert_allclose(power.ys.x, plain.ys.x, rtol=1e-8)
+
+
+def test_paths_of_free_parameters():
+    system = Duffing()
+    both = FreeParameters.of(system, ("omega",), ("c",))
+    assert both.paths == both.fixed.paths == (("omega",), ("c",))
+    for free in (both, both.fixed):
+        moved = free.put(system, np.array([1.5, 0.25]))
+        assert (float(moved.omega), float(moved.c), moved.F) == (1.5, 0.25, 1.0)
+    assert FreeParameters.of(system).put(system, np.zeros(0)) is system
