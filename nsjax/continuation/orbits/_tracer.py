@@ -24,6 +24,7 @@ VANISHES = 1e-6  # a test function that is smaller, where another one vanishes
 SAME = 1e-6  # two orbits at one parameter that are nearer are one
 SINGULAR = 1e-3  # the test function of branch points, over its value a step before, where another zero is that of one
 ASIDE = 1e-2  # from a branch point, in steps: a fold that is nearer is the branch point's own
+RANK = {kind: i for i, kind in enumerate((*CORNERS, "branch", "low", "high"))}  # what vanishes together is the first
 
 
 @dataclasses.dataclass
@@ -154,8 +155,8 @@ class OrbitTracer(AbstractTracer[OrbitPoint]):
         """The zeros of the test functions that change their sign between two points, and those whose zero is not to be
         found."""
         before, after = (test_values(self.curve, p, scale) for p in (spot, step))
-        found, lost = [], []
-        for test, value in before.items():
+        found, lost, seen = [], [], {0.0: spot, length: step}
+        for test, value in sorted(before.items(), key=lambda item: RANK.get(item[0].kind, 99)):
             if test not in after or after[test] == 0:
                 continue
             if test.kind in CORNERS and abs(value) < ON < -after[test] and not self.virtual:
@@ -165,10 +166,31 @@ class OrbitTracer(AbstractTracer[OrbitPoint]):
                 continue
             if test.kind in (*CORNERS, "low", "high") and after[test] > 0:
                 continue  # it comes from where it could not be: a start on the point itself
-            zero = self.locate(spot, step, length, test, scale)
+            zero = self.shared(seen, found, test, scale) or self.locate(seen, test, scale)
             found += [] if zero is None else [zero]
             lost += [test] if zero is None else []
         return found, lost
+
+    def shared(self, seen: dict[float, OrbitPoint], found: list[Zero], test: Test, scale: float) -> Zero | None:
+        """The zero of another test function, if this one too changes its sign where zeros are one: at a corner ten of
+        them may vanish."""
+        length = max(seen)
+        for zero in found:
+            sides = [zero.s + side * NEAR / 2 * length for side in (-1, 1)]
+            if sides[0] <= 0 or sides[1] >= length:
+                continue
+            for s in sides:
+                here = seen.get(s) or self.on_chord(seen, s)
+                seen |= {} if here is None else {s: here}
+            values = [test_values(self.curve, seen[s], scale).get(test, np.nan) for s in sides if s in seen]
+            if len(values) == 2 and values[0] * values[1] < 0:
+                return zero._replace(test=test)
+        return None
+
+    def on_chord(self, seen: dict[float, OrbitPoint], s: float) -> OrbitPoint | None:
+        """The point at a distance from the first, between it and the last."""
+        spot, length = seen[0.0], max(seen)
+        return self.at(spot, s, spot.look.u + s / length * (seen[length].look.u - spot.look.u))
 
     def with_those_before(
         self, spot: OrbitPoint, final: Zero, found: list[Zero], near: float, scale: float
@@ -182,7 +204,7 @@ class OrbitTracer(AbstractTracer[OrbitPoint]):
                 continue
             if any(z.test == test and z.s <= final.s for z in found):
                 continue
-            zero = self.locate(spot, last, s, test, scale)
+            zero = self.locate({0.0: spot, s: last}, test, scale)
             found = found if zero is None else [*found, zero]
         return sorted(found, key=lambda zero: zero.s)
 
@@ -213,31 +235,31 @@ class OrbitTracer(AbstractTracer[OrbitPoint]):
 
     def with_others(self, before: OrbitPoint, zero: Zero, together: list[Zero]) -> Zero:
         """What vanishes at one point, by the first of `CORNERS`."""
-        rank = {kind: i for i, kind in enumerate((*CORNERS, "branch", "low", "high"))}
-        several = sorted([zero, *together], key=lambda z: rank.get(z.test.kind, 99))
+        several = sorted([zero, *together], key=lambda z: RANK.get(z.test.kind, 99))
         first = several[0]
         others = tuple(dict.fromkeys(z.test for z in several[1:]))
         off = before.parameter - first.point.parameter
         side = int(np.sign(off if off else -before.look.tangent[-1]))
         return first._replace(others=others, side=side)
 
-    def locate(self, spot: OrbitPoint, step: OrbitPoint, length: float, test: Test, scale: float) -> Zero | None:
-        """By bracketing: the curve is smooth there, and so is the test function, except the least value of a guard."""
-        seen: dict[float, OrbitPoint] = {0.0: spot, length: step}
+    def locate(self, seen: dict[float, OrbitPoint], test: Test, scale: float) -> Zero | None:
+        """By bracketing, between points by their distance from the first: the curve is smooth there, and so is the test
+        function, except the least value of a guard."""
+        length = max(seen)
+        spot, step = seen[0.0], seen[length]
         chord = step.look.u - spot.look.u
         if test.kind == "duration" and test.row in returning(self.curve.model, spot.itinerary):
             begin, end = (test_values(self.curve, p, scale)[test] for p in (spot, step))
             return self.interpolate(spot, length * begin / (begin - end), length, chord, scale, test)
-
-        def at(s: float) -> OrbitPoint | None:
-            return self.at(spot, s, spot.look.u + s / length * chord)
 
         # (At the beginning of a segment the least value of a guard is smooth.)
         inside = any(p.look.where[test.row, test.slot] > 0 for p in (spot, step)) if test.kind == "guard" else False
         s, rough = None, inside
         try:
             xtol = 1e-5 * length if rough else 1e-14
-            s = bracketed(seen, at, lambda here: test_values(self.curve, here, scale)[test], xtol)
+            s = bracketed(
+                seen, lambda s: self.on_chord(seen, s), lambda here: test_values(self.curve, here, scale)[test], xtol
+            )
         except (ArithmeticError, KeyError):  # beyond where the test function is a number
             pass
         if s is None or test == BRANCH:
