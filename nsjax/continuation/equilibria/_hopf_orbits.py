@@ -7,7 +7,6 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 
-from ..._numerics._compile import interactive
 from ...equilibria._equilibrium import Equilibrium
 from ...equilibria._find_equilibrium import find_equilibrium
 from ...flow._results import is_okay
@@ -80,9 +79,8 @@ def hopf_orbits(
     return found
 
 
-@interactive
 def _found(system: System, y: Any, period: Any, options: dict[str, Any]) -> Orbit:
-    """One try, in one program for all."""
+    """One try."""
     return find_orbit(system, y, period=period, **({"method": "shooting"} | options | {"throw": False}))
 
 
