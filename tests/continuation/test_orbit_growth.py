@@ -149,6 +149,7 @@ def test_interrupted(belt, tmp_path, monkeypatch):
     same(growth.branch, whole.branch)
 
 
+@pytest.mark.slow
 def test_branches(belt, duffing, tmp_path):
     for whole, system in ((belt[2].branch, gallery.StickSlip()), (duffing[2].branch, Duffing())):
         whole.save(tmp_path / "branch.npz")

@@ -141,6 +141,7 @@ def end_of_slider(p, **options):
 AT = jnp.array([2.5, -0.5, 0.5])
 
 
+@pytest.mark.slow
 def test_derivatives_of_stick_slip():
     """Through all events, against forty digits."""
     want = reference.solution(reference.StickSlip, 100.0, (2.5, -0.5), wrt=("v_dr",), v_dr=0.5).derivative

@@ -105,7 +105,8 @@ def check(tally: dict, wrong: list) -> None:
     assert told_but_ambiguous(tally) == 0 and share(tally, "needlessly told") <= 0.05
 
 
-@pytest.mark.parametrize("direction", [pytest.param(1, marks=pytest.mark.slow), -1])
+@pytest.mark.slow
+@pytest.mark.parametrize("direction", [1, -1])
 def test_random_clocks(direction):
     *_, tally, wrong = fuzz("square", 50, 0, direction)
     check(tally, wrong)

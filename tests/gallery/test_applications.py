@@ -20,6 +20,7 @@ def test_names():
         gallery.entry("neurone")
 
 
+@pytest.mark.slow
 def test_blocks_that_start_alike_move_alike():
     """The springs between them do nothing: all have the period of section 3.4."""
     chain = gallery.BlockChain(n=2)
@@ -107,7 +108,8 @@ def test_a_buck_converter_flips():
     np.testing.assert_allclose(np.sort(orbit.multipliers.real), want, atol=1e-8)
 
 
-@pytest.mark.parametrize("h, tau", [(0.1, 1.0), pytest.param(0.5, 2.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("h, tau", [(0.1, 1.0), (0.5, 2.0)])
 def test_a_relay_servo_has_its_period_in_closed_form(h, tau):
     half = brentq(lambda p: p - 2 * tau * np.tanh(p / (2 * tau)) - 2 * h, 1e-3, 20.0, xtol=1e-15)
     servo = gallery.RelayServo(h=h, tau=tau)

@@ -278,6 +278,7 @@ def test_a_surface_through_the_origin_is_a_section(section):
     assert found.mode[:, 0].tolist() == [1, 1, 1, 1]
 
 
+@pytest.mark.slow
 def test_sticking_and_relays_are_sections():
     """Where the stick-slip oscillation of section 3.4 is let go: its period; the thermostat's switching on."""
     off = poincare_map(gallery.StickSlip(), "belt", Motion(2.5, 0.0), direction=-1, max_time=60.0, iterates=2)

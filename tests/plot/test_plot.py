@@ -284,6 +284,7 @@ def test_mistakes_with_a_tube_are_named():
         plot.perturbation_tube(stable(), samples=0)
 
 
+@pytest.mark.slow
 def test_an_orbit_that_no_solution_follows_is_drawn_arc_by_arc():
     """It leaves the belt long before F_stick is reached: a solution does not."""
     orbit = infinitely_unstable()
