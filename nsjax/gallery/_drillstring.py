@@ -219,7 +219,7 @@ class DrillstringScene(_Drillstring, SceneModel):
 
 class FreeDrillstringScene(DrillstringScene):
     """`DrillstringScene` without its stator, for motions in the middle, which do not meet it: the branch P1. There the
-    distance from the stator has no derivatives, and the multipliers of a whirl about the middle need some."""
+    distance from the stator has a tip, at which the search for an orbit and its multipliers fails."""
 
     @property
     def scene(self) -> Scene:
