@@ -218,8 +218,8 @@ class DrillstringScene(_Drillstring, SceneModel):
 
 
 class FreeDrillstringScene(DrillstringScene):
-    """`DrillstringScene` without its stator, for motions in the middle, which do not meet it: the branch P1. There the
-    distance from the stator has a tip, at which the search for an orbit and its multipliers fails."""
+    """`DrillstringScene` without its stator, for motions in the middle, which do not meet it: the branch P1. (With it
+    friction on the stator, though there is no contact, meets its surface in the instant in which the bit does.)"""
 
     @property
     def scene(self) -> Scene:
