@@ -1,15 +1,12 @@
 """What `python -m nsjax` does, apart from reading its arguments."""
 
 from ._arguments import parse as parse, USAGE as USAGE
-from ._branches import (
-    Arc as Arc,
-    branch_record as branch_record,
-    Diagram as Diagram,
-    diagram_for as diagram_for,
-    DIAGRAMS as DIAGRAMS,
-    draw_branches as draw_branches,
-)
+from ._branch_record import branch_record as branch_record
+from ._branches import draw_branches as draw_branches
 from ._cache import keep_programs as keep_programs
+from ._diagrams import Diagram as Diagram, diagram_for as diagram_for, DIAGRAMS as DIAGRAMS
+from ._family import Arc as Arc, Followed as Followed
+from ._follow import follow as follow, value_of as value_of
 from ._job import (
     Job as Job,
     load as load,
@@ -32,4 +29,14 @@ from ._report import (
     record as record,
     report as report,
     simulation_record as simulation_record,
+)
+from ._search import (
+    BOUNDS as BOUNDS,
+    controller as controller,
+    find as find,
+    given_mode as given_mode,
+    guess_of as guess_of,
+    note as note,
+    start_of as start_of,
+    tolerances as tolerances,
 )

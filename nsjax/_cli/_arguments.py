@@ -6,7 +6,7 @@ import tempfile
 from typing import NoReturn
 
 from .._version import __version__
-from ._branches import DIAGRAMS
+from ._diagrams import DIAGRAMS
 from ._job import UsageError
 
 
@@ -22,11 +22,13 @@ class _Parser(argparse.ArgumentParser):
 def parse(argv: list[str]) -> argparse.Namespace:
     """The words of the command line, by option.
 
-    **Raises:** `UsageError` where `--json` or `--out` cannot be written; other mistakes end the program.
+    **Raises:** `UsageError` where `--json`, `--out` or `--save` cannot be written; other mistakes end the program.
     """
     args = _parser().parse_args(_joined(argv))
     if getattr(args, "out", None) is not None:
         _check_folder(args.out, "--out")
+    if getattr(args, "save", None) is not None:
+        _check_folder(args.save, "--save")
     if getattr(args, "json", None) not in (None, "-"):
         _check_file(pathlib.Path(args.json), "--json")
     return args
@@ -49,7 +51,9 @@ def _parser() -> argparse.ArgumentParser:
     commands.add_parser("list", help="list the systems of the gallery")
     run = commands.add_parser("run", help="simulate a system, find its periodic orbit, write tables and pictures")
     orbit = commands.add_parser("orbit", help="find a periodic orbit")
-    follow = commands.add_parser("continue", help="follow a periodic orbit while a parameter varies, with pictures")
+    follow = commands.add_parser(
+        "continue", help="follow a periodic orbit, or equilibria, while a parameter varies, with pictures"
+    )
     for command in (run, orbit, follow):
         add = command.add_argument
         add(
@@ -70,6 +74,8 @@ def _parser() -> argparse.ArgumentParser:
             help="write the numbers as JSON; - is standard output, and nothing else goes there",
         )
         add("--traceback", action="store_true", help="show the whole traceback of an error")
+    lasting = "; ".join(f"{key} takes {diagram.lasts}" for key, diagram in DIAGRAMS.items() if diagram.lasts)
+    follow.epilog = f"This takes minutes; {lasting}, on one core. How far it is goes to standard error."
     run.add_argument("--y0", metavar="x=..,v=..", help="where the simulation starts; names of the state, or numbers")
     run.add_argument("--t1", type=float, help="end time (default: that of the gallery, 20 periods, or 100)")
     run.add_argument(
@@ -79,16 +85,29 @@ def _parser() -> argparse.ArgumentParser:
     )
     for command in (orbit, follow):
         command.add_argument(
-            "--y0", metavar="x=..,v=..", help="guess of a state on the orbit; names of the state, or numbers"
+            "--y0",
+            metavar="x=..,v=..",
+            help="guess of a state on the orbit, or of an equilibrium; names of the state, or numbers",
         )
     follow.add_argument("--param", metavar="NAME", help="the parameter that varies")
-    follow.add_argument("--range", metavar="LO,HI", help="of the parameter; the orbit is sought at its value in --set")
+    follow.add_argument("--range", metavar="LO,HI", help="of the parameter; the start is sought at its value in --set")
+    follow.add_argument(
+        "--equilibria",
+        action="store_true",
+        help="follow equilibria and no orbits (A.7 has nothing else; of A.9, both are shown without this)",
+    )
     follow.add_argument(
         "--max-laps",
         type=_count,
         default=None,
         metavar="N",
-        help="the longest period that is followed, over that of the orbit (default: 4, of A.9 1)",
+        help="the longest period that is followed, over that of the orbit (default: 4, of A.9 2)",
+    )
+    follow.add_argument(
+        "--save",
+        type=pathlib.Path,
+        metavar="FOLDER",
+        help="keep the branches in files, to be read by `Branch.load` and `OrbitBranch.load`",
     )
     for command in (run, follow):
         command.add_argument(

@@ -36,15 +36,19 @@ def draw(job: Job, sol: Solution, orbit: Orbit | None, out: pathlib.Path) -> lis
     return save(job, figures, out)
 
 
+def stem(job: Job) -> str:
+    """The name of a job, as the names of its files begin with it."""
+    return re.sub(r"[^\w.]+", "-", job.name.rpartition(":")[2] if not job.from_gallery else job.name).strip("-")
+
+
 def save(job: Job, figures: dict[str, Any], out: pathlib.Path) -> list[pathlib.Path]:
     """Writes figures by their kind, with the name of the job in their file names and titles."""
     out.mkdir(parents=True, exist_ok=True)
-    stem = re.sub(r"[^\w.]+", "-", job.name.rpartition(":")[2] if not job.from_gallery else job.name).strip("-")
     files = []
-    title = f"{job.name}: {job.title}" if job.from_gallery else stem
+    title = f"{job.name}: {job.title}" if job.from_gallery else stem(job)
     for kind, drawn in figures.items():
         drawn.suptitle(textwrap.fill(title, int(11 * drawn.get_figwidth())), fontsize="medium")
-        files.append(out / f"{stem}-{kind}.png")
+        files.append(out / f"{stem(job)}-{kind}.png")
         drawn.savefig(files[-1], dpi=150)
     return files
 

@@ -15,6 +15,7 @@ from .._version import __version__
 from ..derivatives._saltation import saltation_matrices
 from ..flow._results import RESULTS
 from ..flow._solution import Event, Events, Solution
+from ..mechanics import Scene, SceneModel
 from ..orbits._orbit import Orbit
 from ..plot import components
 from ..system._mode import change_words
@@ -41,8 +42,10 @@ class Units(NamedTuple):
     def of(cls, job: Job) -> "Units":
         parameters = notes(type(job.system))
         fields = {} if job.y0 is None or isinstance(job.y0, dict) else notes(type(job.y0))
-        names = components(job.y0)
-        state = {name: fields.get(name.partition("[")[0], Note()).unit for name in names}
+        of_scene = _units_of_scene(job.system)
+        state = {
+            name: of_scene.get(name, fields.get(name.partition("[")[0], Note()).unit) for name in components(job.y0)
+        }
         used = [*state.values(), *(note.unit for note in parameters.values())]
         time = "s" if any("s" in unit.replace("/", " ").split() for unit in used) else ""
         if job.from_gallery:
@@ -60,6 +63,13 @@ class Units(NamedTuple):
             for j, below in enumerate(self.state.values(), 1)
         }
         return named | entries
+
+
+def _units_of_scene(system: System) -> dict[str, str]:
+    """Of the state of a scene, whose class says none: `{"q.x": "m", "v.x": "m/s"}`."""
+    scene = system.scene if isinstance(system, SceneModel) else system
+    units = scene.units if isinstance(scene, Scene) else {}
+    return {f"q.{name}": unit for name, unit in units.items()} | {f"v.{n}": ratio(u, "s") for n, u in units.items()}
 
 
 def _symbol(name: str) -> str:

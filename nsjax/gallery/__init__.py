@@ -27,6 +27,8 @@ from ._catalogue import entry as entry, SYSTEMS as SYSTEMS, thesis as thesis
 from ._drillstring import (
     DrillstringModel as DrillstringModel,
     DrillstringScene as DrillstringScene,
+    EccentricDrillstringScene as EccentricDrillstringScene,
+    FreeDrillstringScene as FreeDrillstringScene,
     TorsionModel as TorsionModel,
     Twist as Twist,
     TwistedWhirl as TwistedWhirl,

@@ -45,7 +45,8 @@ class BlockChain(SceneModel):
             f"belt{i}": Friction(name, v=self.v_dr, slip=self.F_slip, stick=self.F_stick)
             for i, name in enumerate(names, 1)
         }
-        return Scene({name: self.m for name in names}, **ground, **between, **belts)
+        masses, units = dict.fromkeys(names, self.m), dict.fromkeys(names, "m")
+        return Scene(masses, units=units, **ground, **between, **belts)
 
 
 class Pad(NamedTuple):
@@ -112,6 +113,7 @@ class GearPair(SceneModel):
     def scene(self) -> Scene:
         return Scene(
             {"d": self.m},
+            units={"d": "m"},
             mesh=Backlash("d", k_f=self.k, x_c=self.b),
             damper=Damper("d", c=self.c),
             load=Constant("d", self.F_m),
@@ -139,6 +141,7 @@ class Clutch(SceneModel):
     def scene(self) -> Scene:
         return Scene(
             {"theta": self.J},
+            units={"theta": "rad"},
             shaft=Spring("theta", k=self.k),
             damper=Damper("theta", c=self.c),
             disc=Friction("theta", Falling(self.T_0, self.delta), v=self.omega),

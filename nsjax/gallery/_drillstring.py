@@ -12,7 +12,7 @@ from ..mechanics._effect import Effect
 from ..mechanics._friction import Friction
 from ..mechanics._friction_law import Coulomb, Falling, falling
 from ..mechanics._model import SceneModel
-from ..mechanics._rotor import FluidForce, stator_contact
+from ..mechanics._rotor import FluidForce, stator_contact, TurningForce
 from ..mechanics._scene import Scene
 from ..mechanics._spring import Damper, Spring
 from ..system._sgn import sgn
@@ -200,7 +200,7 @@ class WhirlScene(_Rotor, SceneModel):
 
     @property
     def scene(self) -> Scene:
-        return Scene(dict(x=self.m, y=self.m), **_lateral(self))
+        return Scene(dict(x=self.m, y=self.m), units=dict(x="m", y="m"), **_lateral(self))
 
 
 class DrillstringScene(_Drillstring, SceneModel):
@@ -210,7 +210,38 @@ class DrillstringScene(_Drillstring, SceneModel):
     def scene(self) -> Scene:
         return Scene(
             dict(x=self.m, y=self.m, phi=self.J),
+            units=dict(x="m", y="m", phi="rad"),
             **_lateral(self, "phi"),
             shaft=Spring("phi", k=self.k_phi),
             bit=Friction("phi", Falling(self.T_0, self.delta), v=-self.omega),
         )
+
+
+class FreeDrillstringScene(DrillstringScene):
+    """`DrillstringScene` without its stator, for motions in the middle, which do not meet it: the branch P1. (With it
+    friction on the stator, though there is no contact, meets its surface in the instant in which the bit does.)"""
+
+    @property
+    def scene(self) -> Scene:
+        return super().scene.without("wall")
+
+
+class EccentricDrillstringScene(DrillstringScene):
+    """`DrillstringScene` with a small force that turns with the drive, as that of an eccentric mass.
+
+    Without it a rotor that is exactly in the middle of its stator stays there, stable or not. With it a slow sweep of ω
+    shows the hysteresis of section A.10:
+
+    ```python
+    there_and_back = jnp.concatenate([jnp.linspace(2.0, 3.6, 33), jnp.linspace(3.6, 0.3, 67)])
+    swept = nsjax.brute_force(system, "omega", there_and_back, system.state(), carry=True, transient=150, keep=20)
+    ```
+    """
+
+    f_0: float = 1e-4  # the force [N]
+
+    @property
+    def scene(self) -> Scene:
+        plain = super().scene
+        turning = TurningForce("x", "y", self.f_0, self.omega)
+        return Scene(dict(zip(plain.coordinates, plain.mass)), units=plain.units, **plain.effects, eccentric=turning)

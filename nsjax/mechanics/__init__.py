@@ -27,7 +27,7 @@ from ._friction_law import (
     Stribeck as Stribeck,
 )
 from ._model import SceneModel as SceneModel
-from ._rotor import FluidForce as FluidForce, stator_contact as stator_contact
+from ._rotor import FluidForce as FluidForce, stator_contact as stator_contact, TurningForce as TurningForce
 from ._scene import Scene as Scene
 from ._spring import (
     Backlash as Backlash,

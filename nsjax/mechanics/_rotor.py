@@ -74,6 +74,35 @@ class FluidForce(Effect):
         return {(self.spin, self.x): self.m_f * z, (self.spin, self.y): -self.m_f * x}
 
 
+class TurningForce(Effect):
+    """A force in the plane of the rotor's middle that turns, as that of an eccentric mass:
+    F_x = f_0 cos(ω t), F_y = f_0 sin(ω t). Its period is that of the scene.
+
+    **Arguments:**
+
+    - `x`, `y`: the coordinates of the rotor's middle.
+    - `f_0`: force [N].
+    - `omega`: angular velocity [rad/s].
+    """
+
+    formula: ClassVar[str] = "f_0 (cos(omega t), sin(omega t))"
+
+    x: str = eqx.field(static=True)
+    y: str = eqx.field(static=True)
+    f_0: float = 1.0
+    omega: float = 1.0
+
+    def forces(self, t: Any, y: State, s: SwitchValues) -> Mapping[str, Number]:
+        return {self.x: self.f_0 * jnp.cos(self.omega * t), self.y: self.f_0 * jnp.sin(self.omega * t)}
+
+    @property
+    def period(self) -> Any:
+        return 2 * jnp.pi / self.omega
+
+    def laws(self) -> list[tuple[str, str, Any, Any]]:
+        return [("omega", "above zero", jnp.asarray(self.omega) > 0, self.omega)]
+
+
 class _Polar(Direction):
     """A direction in the plane of the rotor's middle. In the middle of the stator, where there is none, it is zero."""
 

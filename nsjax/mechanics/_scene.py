@@ -55,11 +55,13 @@ class Scene(System):
     - `coordinates`: the masses by the names of the coordinates [kg], or, with `mass`, the names alone.
     - `mass`: a symmetric mass matrix in the order of the names, or a function of q that returns one (as rows, or as
         `{"x": m, ("x", "phi"): m_12}`); its Coriolis terms are added. Zeros that are numbers are left out.
+    - `units`: of the coordinates by their names, as `{"x": "m", "phi": "rad"}`: for pictures and reports of the command
+        line. Nothing is computed with them.
     - `effects`: what acts, by name.
 
-    **Raises:** `TypeError` for what is no effect; `ValueError` for an effect that asks for an unknown coordinate or
-    contact, that is named as something a scene has already, for a mass that is not positive, or for forces whose
-    periods have no common one.
+    **Raises:** `TypeError` for what is no effect; `ValueError` for units of an unknown coordinate, for an effect that
+        asks for an unknown coordinate or contact, or is named as something a scene has already, for a mass that is not
+        positive, or for forces whose periods have no common one.
     """
 
     mass: Any
@@ -67,8 +69,17 @@ class Scene(System):
     names: tuple[str, ...] = eqx.field(static=True)
     coordinates: tuple[str, ...] = eqx.field(static=True)
     multiple: int = eqx.field(static=True)  # how many of the first period of an effect make the scene's
+    unit_list: tuple[str, ...] = eqx.field(static=True)  # of the coordinates; empty where none is known
 
-    def __init__(self, coordinates: Mapping[str, Any] | Sequence[str], /, *, mass: Any = None, **effects: Effect):
+    def __init__(
+        self,
+        coordinates: Mapping[str, Any] | Sequence[str],
+        /,
+        *,
+        mass: Any = None,
+        units: Mapping[str, str] | None = None,
+        **effects: Effect,
+    ):
         by_name = isinstance(coordinates, Mapping)
         if isinstance(coordinates, str) or not (by_name or isinstance(coordinates, Sequence)):
             raise TypeError(
@@ -80,6 +91,12 @@ class Scene(System):
         kind = coordinates_type(coordinates)
         self.coordinates = kind._fields
         self.mass = given_mass(coordinates if by_name else mass, kind._fields)
+        for name in units or {}:
+            if name not in kind._fields:
+                known = ", ".join(kind._fields)
+                text = f"Argument `units` must name coordinates of the scene ({known}), but names `{name}`."
+                raise ValueError(text + did_you_mean(str(name), kind._fields))
+        self.unit_list = tuple((units or {}).get(name, "") for name in kind._fields)
         for name, effect in effects.items():
             _check_effect(name, effect)
         self.names, self.effect_list, self.multiple = tuple(effects), tuple(effects.values()), 1
@@ -102,6 +119,11 @@ class Scene(System):
     def effects(self) -> dict[str, Effect]:
         """The effects by name."""
         return dict(zip(self.names, self.effect_list))
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The units of the coordinates that have one, by name."""
+        return {name: unit for name, unit in zip(self.coordinates, self.unit_list) if unit}
 
     @property
     def placed(self) -> list[tuple[str, Effect]]:
@@ -222,8 +244,8 @@ class Scene(System):
             self._effect("names", name)
         left = {name: effect for name, effect in self.effects.items() if name not in names}
         if isinstance(self.mass, tuple):
-            return Scene(dict(zip(self.coordinates, self.mass)), **left)
-        new = Scene({name: 1.0 for name in self.coordinates}, **left)
+            return Scene(dict(zip(self.coordinates, self.mass)), units=self.units, **left)
+        new = Scene({name: 1.0 for name in self.coordinates}, units=self.units, **left)
         return eqx.tree_at(lambda scene: scene.mass, new, self.mass)
 
     def force(self, name: str, t: Any, y: State, mode: Any = ()) -> Any:

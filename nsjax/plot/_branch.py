@@ -18,17 +18,21 @@ from ._style import axes_or_new, axis_label, Labels, legend as add_legend
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+Measure = str | Callable[[Any], Any] | None
+
 PERIODIC = dict(color="0.6", linewidth=1.6)
 
 
 def bifurcation_diagram(
     branch: Branch,
-    measure: str | Callable[[Any], Any] | None = None,
+    measure: Measure = None,
     *,
     orbits: Sequence[Sequence[Orbit]] = (),
+    names: bool | Callable[[Bifurcation], str] = True,
     ax: "Axes | None" = None,
     labels: Labels = None,
     legend: bool = True,
+    **style: Any,
 ) -> "Axes":
     """Draws branches of equilibria over the parameter, stable ones solid, unstable ones dashed, with their special
     points; and branches of periodic orbits in grey; Figs. 5.4 to 5.16.
@@ -40,28 +44,26 @@ def bifurcation_diagram(
         state; by default the first component.
     - `orbits`: branches of periodic orbits, each a sequence in the order of the parameter; their largest and least
         measure along the orbit is drawn.
+    - `names`: whether to write what the special points are; or a function of a `Bifurcation` that gives the words, none
+        if empty.
     - `ax`: where to draw; by default a new figure.
     - `labels`: for the axes, as `{"mu": "μ [-]", "x": "x [m]"}`, a function of the state being "measure".
     - `legend`: whether to explain the lines.
+    - `style`: for the lines, as in `Axes.plot`.
 
     **Returns:** the axes.
 
     **Raises:** `ValueError` for an unknown component.
     """
     ax = axes_or_new(ax)
-    names = list(components(jax.tree.map(lambda x: x[0], branch.ys)))
-    if measure is None:
-        measure = names[0]
-    if isinstance(measure, str) and measure not in names:
-        raise ValueError(f"Argument `measure` must be one of {', '.join(names)}, or a function, but got {measure!r}.")
+    measure = _known(branch, measure)
     for one in branch.branches:
-        stretches(ax, one.values, _measured(measure, one.ys), one.stable, _styles("equilibrium"), LINE)
+        stretches(ax, one.values, _measured(measure, one.ys), one.stable, _styles("equilibrium"), LINE | style)
     for family in orbits:
         _periodic(ax, family, branch.parameter, measure)
-    points: dict[int, Bifurcation] = {}
-    for one in branch.branches:
-        points |= {id(special): special for special in one.special}
-    write_names(ax, [_point(ax, special, measure) for special in points.values()])
+    points = {id(special): special for one in branch.branches for special in one.special}
+    places = [_point(ax, special, measure, names) for special in points.values()]
+    write_names(ax, [place for place in places if place[2]])
     name = measure if isinstance(measure, str) else "measure"
     ax.set_xlabel(axis_label(labels, branch.parameter))
     ax.set_ylabel(axis_label(labels, name))
@@ -96,9 +98,35 @@ def _periodic(ax: "Axes", family: Sequence[Orbit], parameter: str, measure: str 
         stretches(ax, np.array(values), np.array(extreme), np.array(stable), _styles("periodic orbit"), PERIODIC)
 
 
-def _point(ax: "Axes", special: Bifurcation, measure: str | Callable[[Any], Any]) -> tuple[float, float, str]:
+def heights_of(branch: Branch, measure: Measure) -> np.ndarray:
+    """What stands for each of the states of a branch, without the others; `measure` as for `bifurcation_diagram`."""
+    return _measured(_known(branch, measure), branch.ys)
+
+
+def height_of(branch: Branch, special: Bifurcation, measure: Measure) -> float:
+    """What stands for the state at a special point of a branch."""
+    return _height(special, _known(branch, measure))
+
+
+def _known(branch: Branch, measure: Measure) -> str | Callable[[Any], Any]:
+    names = list(components(jax.tree.map(lambda x: x[0], branch.ys)))
+    if measure is None:
+        return names[0]
+    if isinstance(measure, str) and measure not in names:
+        raise ValueError(f"Argument `measure` must be one of {', '.join(names)}, or a function, but got {measure!r}.")
+    return measure
+
+
+def _height(special: Bifurcation, measure: str | Callable[[Any], Any]) -> float:
+    return float(_measured(measure, jax.tree.map(lambda x: np.asarray(x)[None], special.y))[0])
+
+
+def _point(
+    ax: "Axes", special: Bifurcation, measure: str | Callable[[Any], Any], names: bool | Callable[[Bifurcation], str]
+) -> tuple[float, float, str]:
     """Marks it, and says where it is and what is written beside it."""
-    height = float(_measured(measure, jax.tree.map(lambda x: np.asarray(x)[None], special.y))[0])
-    bifurcation = special.is_bifurcation
-    mark(ax, special.value, height, special.discontinuous, bifurcation)
-    return special.value, height, wording(special.name, keep=special.kind == "none")
+    height = _height(special, measure)
+    mark(ax, special.value, height, special.discontinuous, special.is_bifurcation)
+    if callable(names):
+        return special.value, height, names(special)
+    return special.value, height, wording(special.name, keep=special.kind == "none") if names else ""

@@ -28,7 +28,7 @@ def stretches(
             continue
         last = min(end + 1, len(x))
         linestyle, label, *more = styles[kinds[start]]
-        own = dict(style, zorder=2, linestyle=linestyle, label=label) | dict(*more)
+        own = dict(zorder=2) | style | dict(linestyle=linestyle, label=label) | dict(*more)
         ax.plot(x[start:last], y[start:last], **own)
         start = end
 

@@ -75,15 +75,15 @@ def orbit_diagram(
     **Raises:** `ValueError` for an unknown component, or a record or function that is not one number for each point.
     """
     ax = axes_or_new(ax)
-    heights = [_measured(measure, one) for one in branch.branches]
+    heights = [measured(measure, one) for one in branch.branches]
     for one, height in zip(branch.branches, heights):
         stretches(ax, one.values, height, _kinds(one), STYLES, LINE)
     words = []
-    for special, k, i in _special_points(branch):
+    for special, k, i in special_points(branch):
         height = float(heights[k][i])
         mark(ax, special.value, height, special.discontinuous, special.is_bifurcation)
         words.append((special.value, height, _words(names, special)))
-    _write(ax, words)
+    write_once(ax, words)
     ax.set_xlabel(axis_label(labels, branch.parameter))
     ax.set_ylabel(_measure_label(measure, branch, labels))
     if legend:
@@ -128,7 +128,7 @@ def multiplier_diagram(
         raise ValueError(f"Argument `which` must be 'all' or 'largest', but is {which!r}.")
     ax = axes_or_new(ax)
     shown, default = PARTS[part]
-    special = [found for found, _, _ in _special_points(branch)]
+    special = [found for found, _, _ in special_points(branch)]
     autonomous = branch.system.period is None
     lines = [line for one in branch.branches if one.admissible.any() for line in _lines(one, autonomous, which)]
     jumps = [(found.value, path) for found in special for path in _jumps(found, autonomous, which)]
@@ -160,7 +160,7 @@ def multiplier_diagram(
         clip = dict(clip_on=not np.isinf(ends).any())
         ax.plot(np.full(len(places), found.value), places, color=color, **HALF, **clip)
         words.append((found.value, float(np.max(places)), _words(names, found)))
-    _write(ax, words)
+    write_once(ax, words)
     ax.set_xlabel(axis_label(labels, branch.parameter))
     ax.set_ylabel(axis_label(labels, "multiplier", default))
     if legend:
@@ -191,7 +191,8 @@ def multiplier_circle(bifurcation: OrbitBifurcation, *, ax: "Axes | None" = None
     return eigenvalue_path(path_between(*bifurcation.monodromies, multipliers=True), ax=ax, labels=labels)
 
 
-def _measured(measure: Measure, branch: OrbitBranch) -> np.ndarray:
+def measured(measure: Measure, branch: OrbitBranch) -> np.ndarray:
+    """What stands for each orbit of a branch, without the others; `measure` as for `orbit_diagram`."""
     recorded = branch.records.get(measure) if isinstance(measure, str) else None
     if recorded is None and not callable(measure):
         return amplitude(branch, measure)
@@ -224,7 +225,7 @@ def _kinds(branch: OrbitBranch) -> np.ndarray:
     return kinds
 
 
-def _special_points(branch: OrbitBranch) -> Iterator[tuple[OrbitBifurcation, int, int]]:
+def special_points(branch: OrbitBranch) -> Iterator[tuple[OrbitBifurcation, int, int]]:
     """Each once: itself, on which of the branches (0 is the first), and at which of its points."""
     seen: set[int] = set()
     for k, one in enumerate(branch.branches):
@@ -234,7 +235,7 @@ def _special_points(branch: OrbitBranch) -> Iterator[tuple[OrbitBifurcation, int
             seen.add(id(special))
 
 
-def _write(ax: "Axes", words: Sequence[tuple[float, float, str]]) -> None:
+def write_once(ax: "Axes", words: Sequence[tuple[float, float, str]]) -> None:
     """Names beside their points, each once: orbits that are images of each other bifurcate at the same place."""
     ax.margins(0.06, 0.16)  # room for them
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import nsjax
 from nsjax import __main__ as command, gallery
+from nsjax._cli import _follow, _search
 from nsjax._cli._mistakes import advice
 from nsjax._cli._units import notes, ratio
 
@@ -145,7 +146,7 @@ def test_other_parameters_than_the_gallerys_are_searched_from_nothing(tmp_path, 
         orbits.append((orbit, kwargs["max_laps"]))
         raise OSError("enough")
 
-    monkeypatch.setattr(command, "continue_orbit", follow)
+    monkeypatch.setattr(_follow, "continue_orbit", follow)
     run("continue", "6.7", *told, "--max-laps", "2", "--out", tmp_path)
     ((orbit, laps),) = orbits
     assert float(orbit.period) == pytest.approx(damped_period(0.5), abs=1e-8) and laps == 2
@@ -186,7 +187,7 @@ def test_state_that_is_an_array(thermostat, tmp_path, monkeypatch):
     def no_orbit(*args, **kwargs):
         raise RuntimeError("none\nwas found")
 
-    monkeypatch.setattr(command, "find_orbit", no_orbit)
+    monkeypatch.setattr(_search, "find_orbit", no_orbit)
     argv = ["run", thermostat, "--set", "k=0.1", "--y0", "20,19", "--t1", "8", "--out", tmp_path / "out"]
     status, out, err = run(*argv)
     assert status == 0, err
@@ -271,7 +272,7 @@ def test_json_makes_its_folder(tmp_path, monkeypatch):
     class Found:
         result = nsjax.RESULTS.successful
 
-    monkeypatch.setattr(command, "find_orbit", lambda *args, **kwargs: Found)
+    monkeypatch.setattr(_search, "find_orbit", lambda *args, **kwargs: Found)
     monkeypatch.setattr(command, "report", lambda *args: "report")
     monkeypatch.setattr(command, "orbit_record", lambda orbit: {})
     assert run("orbit", "3.4", "--json", tmp_path / "deep" / "numbers.json")[0] == 0
@@ -281,7 +282,7 @@ def test_json_makes_its_folder(tmp_path, monkeypatch):
 def test_a_file_with_one_model_needs_no_name(thermostat, tmp_path, monkeypatch):
     """Issue 20.17: classes count, be there a base or an instance of it."""
     seen = []
-    monkeypatch.setattr(command, "find_orbit", lambda system, *args, **kwargs: seen.append(system))
+    monkeypatch.setattr(_search, "find_orbit", lambda system, *args, **kwargs: seen.append(system))
     path, _, _ = thermostat.rpartition(":")
     status, _, err = run("orbit", path, "--y0", "1,2")
     assert status == 2 and err.count("\n") == 1
@@ -366,7 +367,7 @@ def test_no_orbit_is_status_1(monkeypatch):
     class Failed:
         result = nsjax.RESULTS.max_steps_reached
 
-    monkeypatch.setattr(command, "find_orbit", lambda *args, **kwargs: Failed)
+    monkeypatch.setattr(_search, "find_orbit", lambda *args, **kwargs: Failed)
     status, out, err = run("orbit", "3.4")
     assert (status, out) == (1, "")
     assert err.startswith("nsjax: no periodic orbit") and err.count("\n") == 1
@@ -379,7 +380,7 @@ def test_options_reach_the_search(monkeypatch):
         tries.append(dict(kwargs, system=system, y0=y0))
         raise RuntimeError("lost")
 
-    monkeypatch.setattr(command, "find_orbit", search)
+    monkeypatch.setattr(_search, "find_orbit", search)
     argv = "orbit 6.9 --set omega=1.7,k=2 --set m=3 --y0 -1,2 --tol 1e-9 --mode belt=-1".split()
     status, _, err = run(*argv)
     assert status == 1 and err.count("\n") == 1
@@ -459,3 +460,12 @@ def test_units_are_read_from_comments():
 )
 def test_ratio_of_units(unit, other, expected):
     assert ratio(unit, other) == expected
+
+
+def test_the_units_of_a_scene_are_those_of_its_coordinates(tmp_path):
+    """Gear rattle: d in metres. Lengths and velocities, on paper and in JSON."""
+    file = tmp_path / "numbers.json"
+    status, out, err = run("run", "gear rattle", "--t1", "1", "--out", tmp_path, "--json", file)
+    assert status == 0, err
+    assert re.search(r"q\.d = [\d.]+ m, v\.d = \S+ m/s", out) and "[-]" not in out
+    assert json.loads(file.read_text())["units"]["state"] == {"q.d": "m", "v.d": "m/s"}

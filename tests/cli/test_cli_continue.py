@@ -9,7 +9,7 @@ from command_line import run
 
 import nsjax
 from nsjax import __main__ as command, _cli
-from nsjax._cli import _branches
+from nsjax._cli import _branches, _follow, _search
 from nsjax._cli._report import _symbol
 
 
@@ -26,9 +26,9 @@ def continued(tmp_path_factory):
         kept.append(original(*args, **kwargs))
         return kept[-1]
 
-    original = command.continue_orbit
+    original = _follow.continue_orbit
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(command, "continue_orbit", keeping)
+        patch.setattr(_follow, "continue_orbit", keeping)
         status, out, err = run(
             *"continue 6.7 --param v_dr --range 0.9,1.2 --set v_dr=1 --period 6.6 --y0 2.3,0".split(),
             "--out", folder / "pictures", "--json", folder / "numbers.json",
@@ -103,7 +103,8 @@ def test_special_points_are_told_once(continued):
 def test_the_diagram_shows_the_equilibrium(continued, tmp_path):
     *_, branch = continued
     job = _cli.load("6.7", {}, None)
-    files = _cli.draw_branches(job, branch, _cli.diagram_for(job, None, None), tmp_path)
+    diagram = _cli.diagram_for(job, None, None)
+    files = _cli.draw_branches(job, [_cli.Followed(diagram.families[0], branch)], diagram, tmp_path)
     assert [path.name for path in files] == ["6.7-bifurcation-diagram.png", "6.7-multiplier-diagram.png"]
 
 
@@ -114,12 +115,13 @@ def test_the_drillstring_is_shown_by_its_lowest_speed(tmp_path):
     orbit = nsjax.find_orbit(job.system, job.guess.y0, period=job.guess.period)
     branch = nsjax.continue_orbit(job.system, orbit, "omega", (1.95, 2.05))
     diagram = _cli.diagram_for(job, None, (1.95, 2.05))
-    (ax,) = _branches._diagram(branch, diagram, True, {}).axes
+    found = [_cli.Followed(diagram.families[0], branch)]
+    (ax,) = _branches._diagram(found, diagram, {}).axes
     assert ax.get_ylabel() == "min θ' [rad/s]"
     e1, p1 = (np.array(line.get_xydata()) for line in ax.lines[:2])
     np.testing.assert_array_equal(e1[:, 0], e1[:, 1])
     assert ax.lines[0].get_label() == "unstable equilibrium" and np.all(p1[:, 1] < 0)  # it slips backwards
-    assert _cli.draw_branches(job, branch, diagram, tmp_path)
+    assert _cli.draw_branches(job, found, diagram, tmp_path)
 
 
 def test_run_with_branches_continues_its_orbit(continued, monkeypatch, tmp_path):
@@ -134,8 +136,8 @@ def test_run_with_branches_continues_its_orbit(continued, monkeypatch, tmp_path)
         asked.append((orbit, parameter, interval))
         return branch
 
-    monkeypatch.setattr(command, "continue_orbit", follow)
-    monkeypatch.setattr(command, "find_orbit", lambda *args, **kwargs: Found)
+    monkeypatch.setattr(_follow, "continue_orbit", follow)
+    monkeypatch.setattr(_search, "find_orbit", lambda *args, **kwargs: Found)
     monkeypatch.setattr(command, "draw", lambda *args: [])
     monkeypatch.setattr(command, "report", lambda *args: "report")
     monkeypatch.setattr(command, "orbit_record", lambda orbit: {})
@@ -182,7 +184,7 @@ def test_mistakes(argv, words):
     ],
 )
 def test_branches_of_section_69_have_the_numbers_of_the_thesis(order, stable, ends, number):
-    assert _cli.DIAGRAMS["6.9"].arcs(_cli.Arc(order, stable, frozenset(ends))) == number
+    assert _cli.DIAGRAMS["6.9"].families[0].arcs(_cli.Arc(order, stable, frozenset(ends))) == number
 
 
 @pytest.mark.parametrize(

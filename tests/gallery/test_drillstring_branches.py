@@ -293,6 +293,27 @@ def test_p2_is_born_at_the_neimark_sacker_point_of_p1(p4):
     assert p4.high.r[0] < 1e-8
 
 
+def test_p1_loses_its_stability_there():
+    """In Cartesian coordinates, without the stator that it does not meet, P1 is an orbit like others."""
+    system = gallery.FreeDrillstringScene(omega=2.25)
+    guess = gallery.entry("A.8").orbit
+    start = system.state(dict(phi=guess.y0.phi), dict(phi=guess.y0.w))
+    branch = nsjax.continue_orbit(
+        system, nsjax.find_orbit(system, start, period=guess.period), "omega", (2.2, 2.3), max_laps=1
+    )
+    (born,) = branch.special_points
+    assert born.kind == "Neimark-Sacker" and not born.discontinuous
+    np.testing.assert_allclose(
+        born.value, brentq(lambda omega: whirl_of_p1(omega) - 1, 2.2, 2.3, xtol=1e-12), atol=1e-8
+    )
+    below = branch.values < born.value
+    assert branch.stable[below].all() and not branch.stable[~below][1:].any()
+    for i in (0, -1):
+        rho = np.abs(branch.multipliers[i])
+        want = whirl_of_p1(branch.values[i])
+        np.testing.assert_allclose(np.sort(rho[np.abs(rho - 1) > 1e-6])[-2:], want, rtol=1e-7)  # a pair
+
+
 def test_p3_begins_where_p2_touches_the_stator(p4):
     """The discontinuous flip: a contact of no duration, with the multipliers on both sides of it."""
     special = next(s for s in p4.special if s.kind == "flip" and s.discontinuous)

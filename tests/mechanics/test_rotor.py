@@ -6,7 +6,18 @@ import numpy as np
 import pytest
 
 import nsjax
-from nsjax.mechanics import Coulomb, Damper, Falling, FluidForce, Friction, Scene, Spring, stator_contact, Viscoelastic
+from nsjax.mechanics import (
+    Coulomb,
+    Damper,
+    Falling,
+    FluidForce,
+    Friction,
+    Scene,
+    Spring,
+    stator_contact,
+    TurningForce,
+    Viscoelastic,
+)
 
 
 # Appendix C.6; J, k_phi, T_0 and delta are ours.
@@ -116,3 +127,19 @@ def test_pure_rolling_has_its_radius_and_whirl_in_closed_form():
     assert list(sol.mode1) == [1, 0]
     angle = -p["R"] * omega / r * 3.0
     np.testing.assert_allclose([sol.y1.q.x, sol.y1.q.y], [r * np.cos(angle), r * np.sin(angle)], rtol=1e-6)
+
+
+def test_a_force_that_turns():
+    """On a mass held by springs: a circle of the radius f_0 / (k - m ω²), once it is on it."""
+    omega, f_0, k, m = 0.7, 0.3, 2.0, 1.5
+    scene = Scene(
+        {"x": m, "y": m}, kx=Spring("x", k=k), ky=Spring("y", k=k), turns=TurningForce("x", "y", f_0=f_0, omega=omega)
+    )
+    assert float(scene.period) == pytest.approx(2 * np.pi / omega)
+    r, t = f_0 / (k - m * omega**2), 2.3
+    sol = nsjax.solve(scene, 0.0, t, scene.state(dict(x=r), dict(y=r * omega)))
+    where = [sol.y1.q.x, sol.y1.q.y, sol.y1.v.x, sol.y1.v.y]
+    c, s = np.cos(omega * t), np.sin(omega * t)
+    np.testing.assert_allclose(where, [r * c, r * s, -r * omega * s, r * omega * c], atol=1e-7)
+    with pytest.raises(ValueError, match="turns.omega"):
+        nsjax.solve(Scene({"x": m, "y": m}, turns=TurningForce("x", "y", omega=-1.0)), 0.0, 1.0, scene.state())

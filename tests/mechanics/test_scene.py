@@ -303,3 +303,13 @@ def test_values_that_cannot_be_are_found_before_anything_is_solved():
 def test_an_effect_is_abstract():
     with pytest.raises(TypeError, match="abstract"):
         Effect()  # pyright: ignore
+
+
+def test_units_of_coordinates():
+    """They are kept by `without`, and change nothing that is computed."""
+    scene = Scene({"x": 1.0, "phi": 2.0}, units={"phi": "rad"}, it=Spring("x", k=1.0), shaft=Spring("phi", k=1.0))
+    assert scene.units == {"phi": "rad"} == scene.without("it").units
+    plain = Scene({"x": 1.0, "phi": 2.0}, it=Spring("x", k=1.0), shaft=Spring("phi", k=1.0))
+    assert plain.units == {} and str(plain) == str(scene)
+    with pytest.raises(ValueError, match=r"`units` must name coordinates of the scene \(x, phi\).*Did you mean `phi`"):
+        Scene({"x": 1.0, "phi": 2.0}, units={"phy": "rad"})

@@ -354,3 +354,14 @@ def test_bifurcation_diagram_of_a_function():
     assert [text.get_text() for text in ax.texts] == ["discontinuous\npitchfork,\nsupercritical"]
     with pytest.raises(ValueError, match="`measure` must be one of x, or a function, but got 'v'"):
         plot.bifurcation_diagram(branch, "v")
+
+
+def test_bifurcation_diagram_with_words_and_lines_of_ones_own():
+    branch = nsjax.continue_equilibrium(gallery.DiscontinuousSaddleNode(1.0), gallery.Line(1.0), "mu", (-1.0, 1.0))
+    (special,) = branch.special_points
+    ax = plot.bifurcation_diagram(branch, names=lambda b: "f" if b is special else "", color="C1", linewidth=0.7)
+    assert [text.get_text() for text in ax.texts] == ["f"]
+    lines = [line for line in ax.lines if line.get_label().endswith("equilibrium")]
+    assert {line.get_label() for line in lines} == {"stable equilibrium", "unstable equilibrium"}
+    assert {(line.get_color(), line.get_linewidth()) for line in lines} == {("C1", 0.7)}
+    assert not plot.bifurcation_diagram(branch, names=False).texts
