@@ -218,8 +218,8 @@ class DrillstringScene(_Drillstring, SceneModel):
 
 
 class FreeDrillstringScene(DrillstringScene):
-    """`DrillstringScene` without its stator, for motions in the middle, which do not meet it: the branch P1. (With it
-    friction on the stator, though there is no contact, meets its surface in the instant in which the bit does.)"""
+    """`DrillstringScene` without its stator, for motions in the middle, which do not meet it: the branch P1. Its
+    programs are a quarter of the size."""
 
     @property
     def scene(self) -> Scene:

@@ -278,3 +278,49 @@ def test_mistakes():
     assert "but names `rub`" in refused(rub.while_("rub"))
     assert "but names `tick`" in refused(rub.while_("tick"), tick)
     assert "but names `other`" in refused(rub.while_("other"), other.while_("floor"))
+
+
+class OneVelocity(nsjax.System):
+    """A block on a belt that moves along a wall, with friction on both: at one velocity. The wall is away."""
+
+    wall_at: float = 2.0
+
+    def vector_field(self, t, y, s):
+        push = (1 + s.wall) / 2
+        return {"v": jnp.cos(t) - 0.3 * s.belt - 0.5 * push * s.rub, "z": jnp.zeros_like(y["z"])}
+
+    @nsjax.sgn
+    def wall(self, t, y):
+        return y["z"] - self.wall_at
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y["v"]
+
+    @nsjax.sgn
+    def rub(self, t, y):
+        return 2 * y["v"]
+
+    rub = rub.while_("wall")
+
+
+class OneFriction(nsjax.System):
+    force: float = 0.3
+
+    def vector_field(self, t, y, s):
+        return jnp.cos(t) - self.force * s.belt
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y
+
+
+@pytest.mark.parametrize("z, force", [(1.0, 0.3), (3.0, 0.8)])
+def test_the_surface_of_another_one_is_met_alone(z, force):
+    """What is not there shares no surface, though its h is zero where that of another switch is."""
+    sol = solve(OneVelocity(), 0.0, 8.0, {"v": jnp.asarray(0.1), "z": jnp.asarray(z)}, **TIGHT)
+    one = solve(OneFriction(force), 0.0, 8.0, jnp.asarray(0.1), **TIGHT)
+    np.testing.assert_allclose(sol.y1["v"], one.y1, atol=1e-10)
+    times, want = ([e.t for e in each.events] for each in (sol, one))
+    assert len(want) >= 2
+    np.testing.assert_allclose(sorted(set(np.round(times, 9))), np.round(want, 9), atol=2e-9)

@@ -180,6 +180,8 @@ def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Ver
             rank = rank + jnp.where(at[k] & better, weight, 0)
     for (i, j), (same, ratio) in here.pairs.items():
         k, other = model.holdable[i], model.holdable[j]
+        for each in filter(model.conditional, (k, other)):  # what is not there shares no surface
+            same = same & ~here.absent(each, mode)
         a, b = mode[k], mode[other]
         one = ~same | (a.astype(t.dtype) == ratio * b.astype(t.dtype))
         # Where only their effects are parallel, one surface that is held does not hold the other.
