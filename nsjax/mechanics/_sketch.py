@@ -147,7 +147,8 @@ class _Drawing:
         for i in blocks:
             ax.plot([i * APART, x], [self.high, y], **LINE | dict(linewidth=0.8, linestyle=(0, (4, 3)), zorder=0))
         ax.plot([x], [y], marker="o", markersize=7, markerfacecolor="white", **LINE)
-        ax.text(x + 0.14, y, label, va="center", **TEXT | dict(ha="left"))
+        clear = dict(facecolor="white", edgecolor="none", pad=0.6)  # of the lines of others
+        ax.text(x + 0.14, y, label, va="center", bbox=clear, **TEXT | dict(ha="left"))
 
 
 def _ends(scene: "Scene", along: Direction) -> dict[str, int] | None:
