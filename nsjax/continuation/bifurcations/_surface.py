@@ -5,12 +5,11 @@ import abc
 import dataclasses
 from typing import Any, Self
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..._numerics._compile import interactive
+from ..._numerics._compile import interactive, on_host
 from ...derivatives._floquet import trivial
 from ...orbits.segments._corrector import Plane
 from ...orbits.segments._equations import linearised, OrbitCurve
@@ -231,7 +230,7 @@ def cleared(curve: OrbitCurve, spot: OrbitPoint) -> OrbitPoint:
             )
             ends = {GRAZING: 2, EVENT: 1}
             orders[1, slot] = ends.get(int(itinerary.ends[row]), 0) if itinerary.slot[row] == slot else 0
-            found = jax.device_get(_guards_along(curve, look, itinerary, np.asarray(row), orders))
+            found = on_host(_guards_along(curve, look, itinerary, np.asarray(row), orders))
             least[row, slot], where[row, slot], spots[row, slot] = (part[slot] for part in found)
     return dataclasses.replace(spot, look=look._replace(least=least, where=where, spots=spots))
 
@@ -274,4 +273,4 @@ def surfaces_of(curve: OrbitCurve, spot: OrbitPoint, test: Test) -> tuple[str, .
 def seen_at(curve: OrbitCurve, itinerary: OrbitItinerary, u: np.ndarray, border: np.ndarray) -> OrbitPoint:
     """What is seen of a point that is known to be one of the surface."""
     found = correct(curve, itinerary, Plane(u, border), newton=False)
-    return spot_of(curve, jax.device_get(found), itinerary)
+    return spot_of(curve, on_host(found), itinerary)

@@ -4,10 +4,10 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
-import jax
 import numpy as np
 
 from ..._numerics._bracket import bracketed
+from ..._numerics._compile import on_host
 from ...orbits.segments._corrector import Plane
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import OrbitItinerary, returning
@@ -57,7 +57,7 @@ class OrbitPoint:
 
 
 def spot_of(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary) -> OrbitPoint:
-    look = jax.device_get(look)
+    look = on_host(look)
     return OrbitPoint(look, itinerary, look.multipliers, bool(look.stable), look.monodromy)
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..._numerics._compile import interactive
+from ..._numerics._compile import interactive, on_host
 from ..._types import Scalar, Y
 from ...flow._solution import Events
 from ...system._model import SwitchedSystem
@@ -190,7 +190,7 @@ def starts_from(
 
         rows = jax.tree.map(lambda *xs: np.stack([filled(x) for x in xs]), *[diaries[i] for i in eventful])
         stacked = jax.tree.map(lambda *xs: np.stack(xs), *[systems[i] for i in eventful])
-        found = jax.device_get(_looked_at(model, like, stacked, rows))
+        found = on_host(_looked_at(model, like, stacked, rows))
         seen = {i: jax.tree.map(lambda x: x[j], found) for j, i in enumerate(eventful)}
     return [
         _start(diary, seen[i], period) if i in seen else _uneventful(*at[i])

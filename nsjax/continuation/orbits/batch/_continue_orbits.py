@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from ...._numerics._compile import on_host
 from ...._numerics._text import shown
 from ...._types import Y
 from ....flow._integrator import Integrator
@@ -159,12 +160,12 @@ def continue_orbits(
     twice = jax.tree.map(lambda x: np.concatenate([x, x]), (lanes, np.array(good)))
     upwards = np.repeat([1.0, -1.0], len(each))
     follow = _Follow(curve, jnp.asarray(max_step), points)
-    found = jax.device_get(sweep(follow, *twice, upwards, chunk=chunk))
+    found = on_host(sweep(follow, *twice, upwards, chunk=chunk))
     return _gathered(curve, parameter, lanes, found)
 
 
 def _unstacked(orbits: Orbit) -> list[Orbit]:
-    whole, static = eqx.partition(jax.device_get(orbits), eqx.is_array_like)
+    whole, static = eqx.partition(on_host(orbits), eqx.is_array_like)
     return [eqx.combine(jax.tree.map(lambda x: x[i], whole), static) for i in range(len(whole.t0))]
 
 

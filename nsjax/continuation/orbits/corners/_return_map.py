@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ...._numerics._compile import interactive
+from ...._numerics._compile import interactive, on_host
 from ....derivatives._flow_map import Directions, flow_map, with_room
 from ....flow._results import is_okay
 from ....flow._solution import Events
@@ -66,7 +66,7 @@ def follow(curve: OrbitCurve, xs: Any, values: Any, reference: Any, begin: Any, 
     directions = directions._replace(system=put_parameter(directions.system, curve.free.paths[0], last))
     rows = []
     for x, value, a, b, mode in zip(xs, values, begin, end, modes):
-        slow, slower = (1.0, 0.0) if curve.autonomous else jax.device_get(_slowed(curve, value, np.asarray(reference)))
+        slow, slower = (1.0, 0.0) if curve.autonomous else on_host(_slowed(curve, value, np.asarray(reference)))
         way = directions._replace(t0=a * slower * last, t1=b * slower * last)
         given = (
             {k.name: m for k, m in zip(model.switches, mode)} if model.holds(mode) else of_relays(model.system, mode)
@@ -76,7 +76,7 @@ def follow(curve: OrbitCurve, xs: Any, values: Any, reference: Any, begin: Any, 
         sol, tangents = flow_map(system, *times, curve.unravel(x), given, integrator, way)
         y1 = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(sol.y1)])
         rows.append((y1, tangents.T, sol.events, is_okay(sol.result)))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(rows))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *on_host(rows))
 
 
 @interactive
