@@ -120,7 +120,7 @@ DIAGRAMS = {
         ),
         measure=Measure("max r [m]"),
         view=(0.0, 4.0),
-        lasts="a quarter of an hour",
+        lasts="twenty minutes",
     ),
 }
 
