@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 LINE = dict(color="black", linewidth=1.6)
 UNSTABLE = (0, (4, 2))
 GAP = 8  # between a point and its name [pt]
+GAPS = (GAP, 20, 34)  # where there is no room at that
+FAR = 3  # how much of a line a name would rather cover than be a point farther away
+LEADER = dict(arrowstyle="-", linewidth=0.5, color="0.5", shrinkA=0, shrinkB=3)  # to a name that is
 WAYS = ((1, -1), (1, 1), (-1, 1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1))  # from a point to its name
 
 
@@ -67,20 +70,21 @@ def write_names(ax: "Axes", points: Sequence[tuple[float, float, str]]) -> None:
         others = marks[np.abs(marks - at).max(axis=1) > 1e-6]
         half = unit * np.array([5.2 * max(map(len, text.split("\n"))), 11.0 * (1 + text.count("\n"))]) / 2
 
-        def middle(way: np.ndarray) -> np.ndarray:
-            return at + way * (half + GAP * unit)
+        def middle(way: np.ndarray, gap: float) -> np.ndarray:
+            return at + way * (half + gap * unit)
 
-        def covered(way: np.ndarray) -> int:
-            inside = int(np.sum(np.all(np.abs(occupied - middle(way)) < half, axis=1)))
-            inside += 2_000 * int(np.sum(np.all(np.abs(others - middle(way)) < half + GAP * unit, axis=1)))
-            outside = np.abs(middle(way) - 0.5) + half > 0.5
-            return inside + 10_000 * int(np.any(outside))
+        def covered(place: tuple[np.ndarray, float]) -> float:
+            center = middle(*place)
+            inside = int(np.sum(np.all(np.abs(occupied - center) < half, axis=1)))
+            inside += 2_000 * int(np.sum(np.all(np.abs(others - center) < half + GAP * unit, axis=1)))
+            outside = np.abs(center - 0.5) + half > 0.5
+            return inside + 10_000 * int(np.any(outside)) + FAR * (place[1] - GAP)
 
-        way = min(map(np.array, WAYS), key=covered)
+        way, gap = min(((np.array(way), gap) for gap in GAPS for way in WAYS), key=covered)
         align = dict(ha=("center", "left", "right")[way[0]], va=("center", "bottom", "top")[way[1]])
-        place = dict(xytext=tuple(GAP * way), textcoords="offset points", fontsize="small", bbox=PLATE, zorder=1)
-        ax.annotate(text, (x, y), **place, **align)
-        occupied = np.concatenate([occupied, _filled(middle(way) - half, middle(way) + half)])
+        place = dict(xytext=tuple(gap * way), textcoords="offset points", fontsize="small", bbox=PLATE, zorder=1)
+        ax.annotate(text, (x, y), arrowprops=LEADER if gap > GAP else None, **place, **align)
+        occupied = np.concatenate([occupied, _filled(middle(way, gap) - half, middle(way, gap) + half)])
 
 
 def _filled(low: np.ndarray, high: np.ndarray) -> np.ndarray:

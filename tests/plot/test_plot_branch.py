@@ -6,8 +6,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from branches import branch_of, special_at
+from matplotlib.text import Text
 
 from nsjax import gallery, plot
+from nsjax.plot._diagram import write_names
 
 
 LABELS = {"omega": "ω [rad/s]", "v_dr": "v [m/s]", "x": "x [m]", "v": "x' [m/s]"}
@@ -189,3 +191,17 @@ def test_circle(forced, belt):
         plot.multiplier_circle(flip)
     with pytest.raises(ValueError, match="finite"):
         plot.multiplier_circle(belt.special[0])
+
+
+def test_names_find_room_farther_away():
+    """Of points in a crowd, each with a line to its name; what has room keeps its place beside the point."""
+    fig, ax = plt.subplots()
+    ax.set(xlim=(0, 1), ylim=(0, 1))
+    crowd = [(0.5 + 0.02 * i, 0.5 + 0.01 * (i % 2), f"P{i} | P{i + 1}") for i in range(6)]
+    ax.plot(*np.transpose([point[:2] for point in crowd]), "o")
+    write_names(ax, [*crowd, (0.1, 0.9, "alone")])
+    fig.canvas.draw()
+    boxes = [Text.get_window_extent(text) for text in ax.texts]
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+    leaders = {text.get_text() for text in ax.texts if text.arrow_patch is not None}
+    assert leaders and "alone" not in leaders
