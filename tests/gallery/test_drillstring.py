@@ -308,6 +308,20 @@ def test_stick_slip_without_stick():
     np.testing.assert_allclose(orbit.events.y_after.phi[1], phi, rtol=1e-10)
 
 
+@pytest.mark.slow
+def test_stick_slip_in_the_middle_of_the_stator():
+    """P1 in the whole scene: at r = 0 the friction of the open contact has its surface where that of the bit is, and is
+    not met there. Whirl decays."""
+    scene = gallery.thesis("A.9", coordinates="cartesian", omega=2.0)
+    orbit = nsjax.find_orbit(scene, scene.state(dict(phi=-2.1307), dict(phi=0.4496)), period=6.296)
+    torsion = nsjax.find_orbit(gallery.thesis("A.8"), Twist(-2.1307, 0.4496), period=6.296)
+    np.testing.assert_allclose(orbit.period, torsion.period, rtol=1e-10)
+    assert [event.switch for event in orbit.events] == ["bit", "bit"] and orbit.stable
+    rho = np.asarray(orbit.multipliers)
+    twist = np.asarray(torsion.multipliers)[np.argmin(np.abs(torsion.multipliers))]
+    assert np.min(np.abs(rho - twist)) < 1e-8 and np.sum(np.abs(rho.imag) > 0.1) == 4
+
+
 BACKWARDS = 0.7422889477650  # where slip backwards appears; as the next test finds it
 
 
