@@ -14,22 +14,22 @@ from ._report import by_name
 
 def branch_record(found: Sequence[Followed]) -> dict[str, Any]:
     """Branches in numbers; their special points are named by their place in the list `special`."""
-    special = [(one, found_in) for found_in in found for one in found_in.branch.special_points]
+    special = [(one, followed) for followed in found for one in followed.branch.special_points]
     place = {id(one): i for i, (one, _) in enumerate(special)}
     return {
         "parameter": found[0].branch.parameter,
         "branches": [
             {
-                "family": family.family.name,
+                "family": followed.family.name,
                 "of": "periodic orbits" if isinstance(one, OrbitBranch) else "equilibria",
-                "points": list(_points(one, family.heights(one))),
+                "points": list(_points(one, followed.heights(one))),
                 "special": [{"point": int(i), "special": place[id(b)]} for i, b in zip(one.indices, one.special)],
                 "ends": list(one.ends),
             }
-            for family in found
-            for one in family.branch.branches
+            for followed in found
+            for one in followed.branch.branches
         ],
-        "special": [_special(one, family) for one, family in special],
+        "special": [_special(one, followed) for one, followed in special],
     }
 
 

@@ -219,7 +219,7 @@ class DrillstringScene(_Drillstring, SceneModel):
 
 class FreeDrillstringScene(DrillstringScene):
     """`DrillstringScene` without its stator, for motions in the middle, which do not meet it: the branch P1. Its
-    programs are a quarter of the size."""
+    programs are a fifth of the size."""
 
     @property
     def scene(self) -> Scene:
@@ -233,8 +233,10 @@ class EccentricDrillstringScene(DrillstringScene):
     shows the hysteresis of section A.10:
 
     ```python
-    there_and_back = jnp.concatenate([jnp.linspace(2.0, 3.6, 33), jnp.linspace(3.6, 0.3, 67)])
-    swept = nsjax.brute_force(system, "omega", there_and_back, system.state(), carry=True, transient=150, keep=20)
+    system = nsjax.gallery.EccentricDrillstringScene(f_0=1e-3)
+    up = [2.1, 2.2, 2.24, 2.3, 2.36, 2.4, 3.0, 3.45, 3.45, 3.45]
+    down = [3.0, 2.6, 2.2, 2.2, 1.5, 1.0, 0.7, 0.5, 0.46, 0.42]
+    swept = nsjax.brute_force(system, "omega", jnp.array(up + down), system.state(), carry=True, transient=30, keep=10)
     ```
     """
 
