@@ -188,7 +188,9 @@ def multiplier_circle(bifurcation: OrbitBifurcation, *, ax: "Axes | None" = None
         )
     if not all(np.isfinite(m).all() for m in bifurcation.monodromies):
         raise ValueError("Argument `bifurcation` must have finite multipliers: the way to infinity has no picture.")
-    return eigenvalue_path(path_between(*bifurcation.monodromies, multipliers=True), ax=ax, labels=labels)
+    path = path_between(*bifurcation.monodromies, multipliers=True)
+    # Those of the point itself: of an autonomous orbit the multiplier 1 stays where it is, but for its rounding.
+    return eigenvalue_path(path._replace(crossings=list(bifurcation.crossings)), ax=ax, labels=labels)
 
 
 def measured(measure: Measure, branch: OrbitBranch) -> np.ndarray:

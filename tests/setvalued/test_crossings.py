@@ -6,6 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
+from nsjax.continuation.orbits.corners._corner import transverse
 from nsjax.plot._eigenvalues import eigenvalue_path as draw
 from nsjax.setvalued._eigenvalue_crossings import eigenvalue_crossings, eigenvalue_path
 
@@ -404,3 +405,20 @@ def test_pictures():
     ax = draw(eigenvalue_path([[0.0]], [[0.0]]))  # stays: drawn, but no crossing
     assert not ax.texts
     plt.close("all")
+
+
+@pytest.mark.parametrize("n", [3, 5])
+def test_without_the_direction_along_an_orbit(n):
+    """Monodromy matrices of an autonomous orbit on both sides of a corner share the flow's direction, not its row: what is
+    between them has the same multipliers without it."""
+    rng = np.random.default_rng(n)
+    flow = rng.normal(size=n)
+    ends = []
+    for _ in range(2):
+        matrix = rng.normal(size=(n, n))
+        ends.append(matrix + np.outer(flow - matrix @ flow, flow) / (flow @ flow))
+    first, second = transverse(*ends)
+    for q in np.linspace(0, 1, 7):
+        whole = np.linalg.eigvals(ends[0] + q * (ends[1] - ends[0]))
+        rest = np.linalg.eigvals(first + q * (second - first))
+        np.testing.assert_allclose(np.sort_complex([*rest, 1.0]), np.sort_complex(whole), atol=1e-9)

@@ -201,7 +201,8 @@ def described(
     words = (arrived, tuple(1 - w for w in arrived) if other is None or other.cycle is None else other.cycle.word)
     crossings = []
     if finite:
-        sides = [_reduced(curve, _monodromy(mapped, word)) for word in words]
+        sides = [_monodromy(mapped, word) for word in words]
+        sides = transverse(*sides) if curve.autonomous else sides
         crossings = eigenvalue_crossings(*sides, multipliers=True) if len(sides[0]) else []
     surfaces = tuple(
         dict.fromkeys(
@@ -240,14 +241,12 @@ def _multipliers(monodromy: np.ndarray) -> np.ndarray:
     return values[np.argsort(-np.abs(values))]
 
 
-def _reduced(curve: OrbitCurve, monodromy: np.ndarray) -> np.ndarray:
-    """Without the direction along an autonomous orbit."""
-    if not curve.autonomous:
-        return monodromy
-    values, vectors = np.linalg.eig(monodromy.T)
-    along = np.real(vectors[:, np.argmin(np.abs(values - 1))])
-    frame = np.linalg.svd(along[None])[2][1:]
-    return frame @ monodromy @ frame.T
+def transverse(*monodromies: np.ndarray) -> list[np.ndarray]:
+    """Without the direction along an autonomous orbit, an eigenvector of all of them with the eigenvalue 1: what they
+    do to the other directions, in one frame, so that there are matrices between them."""
+    eye = np.eye(len(monodromies[0]))
+    frame = np.linalg.svd(np.concatenate([m - eye for m in monodromies]))[2][:-1]
+    return [frame @ m @ frame.T for m in monodromies]
 
 
 def repelled_at(tracer: OrbitTracer, name: str, spot: OrbitPoint, rows: list[int]) -> Node | None:
