@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
-from scipy.optimize import toms748
 
 
 P = TypeVar("P")
@@ -28,6 +27,8 @@ def bracketed(
                 raise ArithmeticError("there is no point")
             seen[s] = here
         return value(seen[s])
+
+    from scipy.optimize import toms748  # slow to import
 
     a, b = _narrowest(seen, value)
     if b - a < KNOWN:

@@ -6,7 +6,6 @@ from typing import Any, TYPE_CHECKING
 import jax
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.optimize import linear_sum_assignment
 
 from .._numerics._text import components
 from ..continuation.orbits._bifurcation import OrbitBifurcation
@@ -287,6 +286,8 @@ def _cuts(branch: OrbitBranch) -> list[int]:
 
 def _followed(rows: Complex[np.ndarray, "points m"]) -> Complex[np.ndarray, "points m"]:
     """Each row in the order that continues the one before: by modulus two that are real would change places."""
+    from scipy.optimize import linear_sum_assignment  # slow to import
+
     out = rows.copy()
     far = np.where(np.isfinite(rows), rows, 1e6)  # two infinite ones are near each other
     for i in range(1, len(rows)):

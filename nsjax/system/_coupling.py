@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.sparse.csgraph import connected_components
 
 from .._numerics._linalg import Row, WRITTEN_OUT
 
@@ -42,10 +41,13 @@ class Coupling(NamedTuple):
                 colours.append([j])
             else:
                 mine.append(j)
-        count, label = connected_components(touches, directed=False) if m else (0, np.zeros(0))
+        linked = touches | touches.T
+        for _ in range(m.bit_length()):  # twice as far each time
+            linked = linked @ linked
+        first = linked.argmax(axis=1) if m else np.zeros(0, int)  # of those that each is coupled to
         groups: dict[Any, list[Block]] = {}
-        for n in range(count):
-            block = tuple(map(int, np.flatnonzero(label == n)))
+        for n in np.unique(first):
+            block = tuple(map(int, np.flatnonzero(first == n)))
             single = m <= WRITTEN_OUT or len(block) > WRITTEN_OUT or any(i in block for i, _ in pairs)
             groups.setdefault(block if single else len(block), []).append(block)
         tables = (touches.tolist(), colours, groups.values())

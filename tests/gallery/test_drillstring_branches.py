@@ -149,6 +149,19 @@ def test_special_points_of_p6_and_p5(p6, which, kind, value):
     check(p6.branches[which], kind, value)
 
 
+def cross(special, first, second):
+    """Whether multipliers of the matrices between two others cross the circle where the point says so, and only there.
+    (That along the orbit is 1.)"""
+
+    def unstable(q):
+        rho = np.linalg.eigvals(first + q * (second - first))
+        return int(np.sum(np.abs(np.delete(rho, np.argmin(np.abs(rho - 1)))) > 1))
+
+    cuts = [0.0, *(c.q for c in special.crossings), 1.0]
+    counts = [{unstable(q) for q in np.linspace(a, b, 42)[1:-1]} for a, b in zip(cuts, cuts[1:])]
+    return all(len(one) == 1 for one in counts) and all(a != b for a, b in zip(counts, counts[1:]))
+
+
 def test_p5_meets_p6_where_the_orbit_touches_the_stator(p6):
     """The thesis calls it a discontinuous fold; multipliers cross the circle at -1 too: no orbit | P5, P6 and one of
     twice the period."""
@@ -158,7 +171,11 @@ def test_p5_meets_p6_where_the_orbit_touches_the_stator(p6):
     np.testing.assert_allclose([special.value, special.period], [omega, period], atol=1e-9)
     free = lap(y, period, omega, [(FREE, None)])[1]
     alike(special.multipliers[0], np.linalg.eigvals(free), 1e-6)
-    alike(special.multipliers[1], np.linalg.eigvals(free @ jump_of_contact(y, omega)), 1e-6)
+    touched = free @ jump_of_contact(y, omega)
+    alike(special.multipliers[1], np.linalg.eigvals(touched), 1e-6)
+    # Conjecture 6.2: a fold and a flip.
+    assert [c.kind for c in special.crossings] == ["+1", "-1"] and special.evidence == "both"
+    assert cross(special, free, touched)
 
 
 def beside_f(omega):
@@ -331,9 +348,10 @@ def test_p3_begins_where_p2_touches_the_stator(p4):
     np.testing.assert_allclose([special.period, special.value], z[3:], atol=1e-8)
     y = np.array([1.0, 0.0, *z[:3]])
     free = lap(y, z[3], z[4], arcs)[1]
-    sides = [np.linalg.eigvals(free @ jump_of_contact(y, z[4])), np.linalg.eigvals(free)]
-    for mine, want in zip(special.multipliers, sides):
-        alike(mine, want, 1e-6)
+    touched = free @ jump_of_contact(y, z[4])
+    for mine, want in zip(special.multipliers, (touched, free)):
+        alike(mine, np.linalg.eigvals(want), 1e-6)
+    assert [c.kind for c in special.crossings] == ["-1"] and cross(special, touched, free)
     assert any(s.mode[0] > 0 for s in p4.segments[i + 2]) != any(s.mode[0] > 0 for s in p4.segments[i - 2])
 
 

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import expm
 
 from ...equilibria._equilibrium import Equilibrium
 from ...equilibria._find_equilibrium import find_equilibrium
@@ -113,6 +112,8 @@ def _beside(curve: OrbitCurve, orbit: OrbitPoint, value: float, guess: np.ndarra
 
 def _point(fold: OrbitPoint, at: _Beside, value: float, y: np.ndarray) -> OrbitPoint:
     """The orbit of size zero."""
+    from scipy.linalg import expm  # slow to import
+
     look, period = fold.look, np.asarray(2 * np.pi / at.root.imag)
     stretch = float(period / look.period)
     begin = look.begin[0]
