@@ -15,6 +15,7 @@ from . import gallery
 from ._cli import (
     BOUNDS,
     branch_record,
+    collect_rarely,
     controller,
     Diagram,
     diagram_for,
@@ -201,8 +202,9 @@ def main(argv: list[str] | None = None) -> int:
     **Returns:** the exit status: 0, 1 for a numerical failure, 2 for a word that means nothing or a mistake in a model.
     """
     jax.config.update("jax_enable_x64", True)
-    if argv is None:
+    if argv is None:  # the process is ours
         keep_programs()
+        collect_rarely()
     try:
         args = parse(sys.argv[1:] if argv is None else argv)
     except UsageError as error:

@@ -1,5 +1,6 @@
-"""Compiled programs, kept from one command to the next."""
+"""Compiled programs, kept from one command to the next; and what else a command does to start quickly."""
 
+import gc
 import os
 import pathlib
 import sys
@@ -31,3 +32,9 @@ def keep_programs() -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def collect_rarely() -> None:
+    """Tracing makes many objects that stay, and looking through them for garbage took a tenth of a command's time."""
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 20)
