@@ -55,6 +55,7 @@ from .flow import (
 )
 from .maps import (
     brute_force as brute_force,
+    lyapunov_spectrum as lyapunov_spectrum,
     poincare_map as poincare_map,
     reduced_map as reduced_map,
     stroboscopic_map as stroboscopic_map,

@@ -1,7 +1,8 @@
-"""Poincaré maps and what is made of them: brute-force diagrams, reduced maps, normal forms."""
+"""Poincaré maps and what is made of them: brute-force diagrams, Lyapunov exponents, reduced maps, normal forms."""
 
 from ._brute_force import brute_force as brute_force, BruteForce as BruteForce
 from ._iterate import Iterate as Iterate
+from ._lyapunov import lyapunov_spectrum as lyapunov_spectrum, LyapunovSpectrum as LyapunovSpectrum
 from ._reduced import reduced_map as reduced_map, ReducedIterate as ReducedIterate
 from ._section import poincare_map as poincare_map
 from ._stroboscopic import stroboscopic_map as stroboscopic_map

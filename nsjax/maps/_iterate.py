@@ -62,6 +62,10 @@ class Start(NamedTuple):
     result: RESULTS
     named: tuple[bool, ...]  # which switches `mode=` of `solve` may name
 
+    def given(self, system: System, mode: Array) -> dict[str, Array]:
+        """A later mode, as `solve` takes it."""
+        return {k.name: mode[i] for i, k in enumerate(system.switches) if self.named[i]}
+
 
 class PoincareMap(eqx.Module):
     """A Poincaré map, applied over and over."""
@@ -115,12 +119,10 @@ class PoincareMap(eqx.Module):
 
     def _stepping(self, system: System, start: Start) -> tuple[tuple, Callable[[tuple], tuple]]:
         system = self.flow_of(system)
-        names = [k.name for k in system.switches]
 
         def step(here: tuple) -> tuple:
             t, y, mode, result = here
-            given = {name: mode[k] for k, name in enumerate(names) if start.named[k]}
-            later, y, mode, now = self.once(system, t, start.t0, y, given)
+            later, y, mode, now = self.once(system, t, start.t0, y, start.given(system, mode))
             # What has failed stays failed; it goes on from NaN, which takes no step.
             result = RESULTS.where(is_okay(result) & (now != RESULTS.successful), now, result)
             return jnp.where(is_okay(result), later, t), unless_failed(result, y), mode, result

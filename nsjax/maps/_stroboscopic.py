@@ -16,16 +16,17 @@ from ..system._system import System
 from ._iterate import Iterate, iterated, PoincareMap, positive
 
 
-class _Phase(PoincareMap):
-    """From one phase of the forcing to the next."""
+class Advance(PoincareMap):
+    """From one phase of the forcing to the same of a later period; or for an autonomous system over an interval."""
 
     order: int = eqx.field(static=True)
+    interval: Scalar | None = None  # the period, if none is given
 
     def flow_of(self, system: System) -> System:
         return system
 
     def horizon(self, system: System, t: Scalar) -> Scalar:
-        return jnp.asarray(system.period, t.dtype) * self.order
+        return jnp.asarray(system.period if self.interval is None else self.interval, t.dtype) * self.order
 
     def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
         # Each time from t0, so that time does not lose digits.
@@ -34,7 +35,7 @@ class _Phase(PoincareMap):
         return t + period, sol.y1, sol.mode1, sol.result
 
 
-def phase_map(system: System, order: int, integrator: Integrator) -> PoincareMap:
+def phase_map(system: System, order: int, integrator: Integrator) -> Advance:
     """The map over periods of the forcing."""
     check_system(system)
     positive("order", order)
@@ -43,7 +44,7 @@ def phase_map(system: System, order: int, integrator: Integrator) -> PoincareMap
             f"Argument `system` must be forced for a map over its period, but `{type(system).__name__}.period` is "
             "None. For an autonomous system take `nsjax.poincare_map` with a section."
         )
-    return _Phase(integrator, order)
+    return Advance(integrator, order)
 
 
 def stroboscopic_map(

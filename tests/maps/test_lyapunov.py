@@ -1,0 +1,218 @@
+"""Lyapunov exponents against closed forms and independent computations."""
+
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from exponents import ImpactOscillator, largest_exponent, StickSlip
+
+import nsjax
+from nsjax.gallery import Motion
+
+
+class Beats(NamedTuple):
+    x: float
+    phase: float
+
+
+class Tent(nsjax.System):
+    """At each beat x is mapped onto a tent: its exponent is the logarithm of the slope, and that of the phase is 0."""
+
+    slope: float = 1.9
+    slow: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Beats(jnp.zeros_like(y.x), self.slow + jnp.zeros_like(y.phase))
+
+    @nsjax.impact
+    def beat(self, t, y):
+        return 1 - y.phase
+
+    @beat.reset
+    def beat(self, t, y):
+        return Beats(self.slope * jnp.minimum(y.x, 1 - y.x), y.phase - 1)
+
+
+class Damped(nsjax.System):
+    """Three exponents: -ζω twice, and that of a variable of its own; the switch is crossed without effect on them."""
+
+    c: float = 0.2
+    decay: float = 1.0
+    omega: float = 2.0
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+    def vector_field(self, t, y, s):
+        x, v, z = y
+        return jnp.stack([v, -x - self.c * v + jnp.cos(self.omega * t), -self.decay * z + s.side])
+
+    @nsjax.sgn
+    def side(self, t, y):
+        return y[0]
+
+
+class Stopped(nsjax.System):
+    """The impact oscillator, forced, with a wall at x = 0; chaotic."""
+
+    c: float = 0.02
+    e: float = 0.8
+    omega: float = 2.825
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - self.c * y.v + jnp.cos(self.omega * t) - s.wall)
+
+    @nsjax.impact
+    def wall(self, t, y):
+        return -y.x
+
+    @wall.restitution
+    def wall(self):
+        return self.e
+
+
+class Driven(nsjax.System):
+    """A forced block on a belt, held by a spring, whose friction is three times as strong at rest; chaotic."""
+
+    omega: float = 2.1
+    a: float = 1.7
+    belt_velocity: float = 0.6
+    stick: float = 3.0
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - s.belt + self.a * jnp.cos(self.omega * t))
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y.v - self.belt_velocity
+
+    @belt.breakaway
+    def belt(self):
+        return self.stick
+
+
+def test_the_tent_map():
+    """To rounding; as lanes; and the determinants of its resets have the same sum."""
+
+    def spectrum(slope):
+        start = Beats(0.3712, 0.25)
+        kwargs = dict(transient=100, span=20, interval=1.0, divergence=True, max_events=4)  # 1.5**-100 is nothing
+        return nsjax.lyapunov_spectrum(Tent(slope), start, **kwargs)
+
+    slopes = np.array([1.5, 1.7, 1.9])
+    found = jax.jit(jax.vmap(spectrum))(jnp.asarray(slopes))
+    np.testing.assert_allclose(found.exponents[:, 0], np.log(slopes), atol=1e-12)
+    np.testing.assert_allclose(found.exponents[:, 1], 0, atol=1e-12)
+    np.testing.assert_allclose(found.residual, 0, atol=1e-12)
+    np.testing.assert_allclose(found.history[:, -1], found.exponents, atol=1e-14)
+    np.testing.assert_allclose(found.dimension, 2)
+    assert "3 spectra of 2" in str(found)
+
+
+def test_decay_of_a_linear_system():
+    """A field that jumps by what the other variables do not feel: the exponents are those of the linear parts."""
+    exact = diffrax.PIDController(rtol=1e-12, atol=1e-12)
+    kwargs = dict(transient=120, span=64, divergence=True, max_events=8, stepsize_controller=exact)
+    found = nsjax.lyapunov_spectrum(Damped(), jnp.array([1.0, 0.0, 0.5]), **kwargs)
+    # The two of the oscillator turn into each other: each goes as 1 / span, their sum is exact.
+    assert float(jnp.sum(found.exponents[:2])) == pytest.approx(-0.2, abs=1e-10)
+    np.testing.assert_allclose(found.exponents[:2], -0.1, atol=2e-2)
+    assert float(found.exponents[2]) == pytest.approx(-1, abs=1e-10)
+    assert abs(float(found.residual)) < 1e-9 and float(found.divergence) == pytest.approx(-1.2, abs=1e-9)
+    assert found.dimension == 0
+
+
+def test_sticking_forgets():
+    """One exponent of the stick-slip orbit of section 3.4 is 0, the other minus infinity, from any phase on."""
+    period = 10 + np.pi + 2 * np.arctan(0.2)
+    entry = nsjax.gallery.entry("3.4")
+    found = nsjax.lyapunov_spectrum(nsjax.gallery.thesis("3.4"), entry.y0, transient=2, span=8, interval=period / 4)
+    assert abs(float(found.exponents[0])) < 1e-8 and float(found.exponents[1]) == -np.inf
+    assert np.isnan(found.errors[1]) and np.isfinite(found.errors[0]) and found.residual is None
+    assert "-inf" in str(found).splitlines()[2]
+
+
+def test_mistakes():
+    forced, free, y0 = Stopped(), nsjax.gallery.thesis("3.4"), Motion(0.1, 0.0)
+    counts = dict(transient=0, span=2)
+    for system, options, words in (
+        (free, counts, "autonomous: argument `interval` must say"),
+        (forced, counts | dict(interval=1.0), "leave out `interval=`"),
+        (forced, counts | dict(exponents=3), "at most 2"),
+        (forced, counts | dict(exponents=1, divergence=True), "all exponents"),
+        (forced, counts | dict(span=0), "`span` must be a positive integer"),
+        (forced, counts | dict(transient=-1), "`transient` must be"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            nsjax.lyapunov_spectrum(system, y0, **options)
+
+
+def test_dimension():
+    """Kaplan & Yorke."""
+
+    def dimension(*rates, errors=0.0):
+        rates = jnp.array(rates)
+        one = jnp.ones(())
+        return nsjax.maps.LyapunovSpectrum(
+            rates, jnp.full(len(rates), errors), rates[None], one, None, rates, nsjax.RESULTS.successful
+        ).dimension
+
+    assert dimension(0.5, 0.0, -2.0) == pytest.approx(2.25)
+    assert dimension(0.5, 1e-6, -np.inf, errors=1e-5) == 2
+    assert dimension(-0.1, -0.2) == 0 and dimension(1.0, 0.5) == 2
+    assert np.isnan(dimension(np.nan, 0.0))
+
+
+def largest(system, starts, transient, span):
+    """Of many solutions: the mean, and its standard error."""
+
+    def lane(y0):
+        kwargs = dict(transient=transient, span=span, exponents=1, max_events=32, throw=False)
+        return nsjax.lyapunov_spectrum(system, y0, **kwargs).exponents[0]
+
+    found = np.asarray(nsjax.sweep(lane, starts))
+    return found.mean(), found.std(ddof=1) / np.sqrt(len(found))
+
+
+@pytest.mark.slow
+def test_chaos_in_stick_slip():
+    """Against solutions in closed form between events: the same to three standard errors, which are below 2e-4."""
+    x, v = np.random.default_rng(1).uniform([[-1], [-1]], [[1], [0.5]], (2, 128))
+    mine, error = largest(Driven(), Motion(jnp.asarray(x), jnp.asarray(v)), 100, 250)
+    theirs, other = largest_exponent(StickSlip(1.7, 2.1, 0.6, 3.0), 128, 100, 250, steps=64)
+    assert max(error, other) < 2e-4 and mine > 0.05
+    assert abs(mine - theirs) < 3 * np.hypot(error, other)
+
+
+@pytest.mark.slow
+def test_chaos_in_impacts():
+    """The same of the impact oscillator, whose rates scatter ten times as much; and the sum of both exponents is that
+    of the damping and of the restitution."""
+    x, v = np.random.default_rng(1).uniform([[-0.6], [0.0]], [[-0.4], [0.2]], (2, 2048))
+    mine, error = largest(Stopped(), Motion(jnp.asarray(x), jnp.asarray(v)), 100, 1700)
+    theirs, other = largest_exponent(ImpactOscillator(1.0, 2.825, 0.02, 0.8), 2048, 100, 1700, steps=24)
+    assert max(error, other) < 2e-4 and mine > 0.1
+    assert abs(mine - theirs) < 3 * np.hypot(error, other)
+
+
+@pytest.mark.slow
+def test_the_sum_of_exponents_in_chaos():
+    """Müller (1995): the determinant of an impact is e²."""
+    exact = diffrax.PIDController(rtol=1e-11, atol=1e-11)
+    kwargs = dict(transient=20, span=200, divergence=True, stepsize_controller=exact)
+    found = nsjax.lyapunov_spectrum(Stopped(), Motion(-0.5, 0.1), **kwargs)
+    assert abs(float(found.residual)) < 1e-7
+    impacts = (float(found.divergence) + Stopped().c) * 200 * float(found.interval) / np.log(0.8**2)
+    assert impacts == pytest.approx(round(impacts), abs=1e-6) and impacts > 100
