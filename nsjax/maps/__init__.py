@@ -1,5 +1,6 @@
-"""Poincaré maps and what is made of them: brute-force diagrams, Lyapunov exponents, reduced maps, normal forms."""
+"""Poincaré maps, and what they are for: diagrams, basins, Lyapunov exponents, normal forms."""
 
+from ._basins import Basins as Basins, basins as basins
 from ._brute_force import brute_force as brute_force, BruteForce as BruteForce
 from ._iterate import Iterate as Iterate
 from ._lyapunov import lyapunov_spectrum as lyapunov_spectrum, LyapunovSpectrum as LyapunovSpectrum

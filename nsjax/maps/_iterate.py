@@ -91,12 +91,15 @@ class PoincareMap(eqx.Module):
         system = self.flow_of(system)
         still, t_still, y_still = frozen((system, t, y))
         model = SwitchedSystem(still, one, t_still, y_still)
-        # An impact that cannot be rested upon has one mode only, of which `solve` wants to hear nothing.
-        named = tuple(k in model.contacts or not isinstance(s, impact) for k, s in enumerate(model.switches))
+        named = _named(model)
         given = {s.name: given[s.name] for s, may in zip(model.switches, named) if may and s.name in given}
         state, _, result = start_mode(model, t_still, y_still, given, self.horizon(still, t))
         modes = [m.astype(jnp.int32) for m in self.sides(model, t_still, y_still, state)]
         return Start(t, t, y, jnp.stack(modes) if modes else jnp.zeros(0, jnp.int32), result, named)
+
+    def named(self, system: System, t: Scalar, y: Y) -> tuple[bool, ...]:
+        """`Start.named`, which depends on nothing but the structure of the model."""
+        return _named(SwitchedSystem.forwards(self.flow_of(system), t, y))
 
     def sides(self, model: SwitchedSystem, t: Scalar, y: Y, state: ModeState) -> tuple[Array, ...]:
         """The mode in which a solution sets out."""
@@ -128,6 +131,11 @@ class PoincareMap(eqx.Module):
             return jnp.where(is_okay(result), later, t), unless_failed(result, y), mode, result
 
         return (start.t, start.y, start.mode, start.result), step
+
+
+def _named(model: SwitchedSystem) -> tuple[bool, ...]:
+    """An impact that cannot be rested upon has one mode only, of which `solve` wants to hear nothing."""
+    return tuple(k in model.contacts or not isinstance(s, impact) for k, s in enumerate(model.switches))
 
 
 @ft.partial(interactive, often=True)

@@ -95,12 +95,14 @@ DIAGRAM = nsjax.maps.BruteForce(
 SPECTRUM = nsjax.maps.LyapunovSpectrum(
     jnp.array([0.06, -jnp.inf]), jnp.array([1e-3, jnp.nan]), jnp.ones((9, 2)), jnp.asarray(3.0), None, STATE, GOOD
 )
+BASINS = nsjax.maps.Basins(np.array([0, 0, -1]), (Motion(*jnp.ones((2, 1))),), np.ones(3, int), ROWS, np.zeros(3, int))
 ITERATE = nsjax.maps.Iterate(jnp.asarray(6.25), STATE, jnp.array([-1, 1]), GOOD)
 REDUCED = nsjax.maps.ReducedIterate(jnp.asarray(0.7), STATE, GOOD)
 TABLE = nsjax.WorkPrecision((Row("Tsit5", 1e-6, 0.1, 1e-7, 2.0, None, ""),), 0.0)
 
 # Result, how many lines at most, and what the text begins with and holds.
 CASES = {
+    "basins": (BASINS, 3, "basins of 1 attractors, 3 starts", "undecided: 33.33%"),
     "Lyapunov exponents": (SPECTRUM, 3, "Lyapunov exponents over 9 intervals of 3: successful", "0.06 ± 0.001"),
     "an orbit": (orbit(), 6, "stable periodic orbit of StickSlip", "multipliers  1+0j, 0.5+0j"),
     "no orbit": (orbit(RESULTS.orbit_not_found), 6, "failed search (orbit_not_found) for a periodic orbit", "residual"),

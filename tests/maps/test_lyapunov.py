@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from exponents import ImpactOscillator, largest_exponent, StickSlip
+from exponents import ImpactOscillator, largest_exponent, mean_of_finite, StickSlip
 
 import nsjax
 from nsjax.gallery import Motion
@@ -183,7 +183,8 @@ def largest(system, starts, transient, span):
         return nsjax.lyapunov_spectrum(system, y0, **kwargs).exponents[0]
 
     found = np.asarray(nsjax.sweep(lane, starts))
-    return found.mean(), found.std(ddof=1) / np.sqrt(len(found))
+    assert np.isfinite(found).mean() > 0.98 and not np.isnan(found).any()
+    return mean_of_finite(found)
 
 
 @pytest.mark.slow
@@ -198,8 +199,8 @@ def test_chaos_in_stick_slip():
 
 @pytest.mark.slow
 def test_chaos_in_impacts():
-    """The same of the impact oscillator, whose rates scatter ten times as much; and the sum of both exponents is that
-    of the damping and of the restitution."""
+    """The same of the impact oscillator, whose rates scatter ten times as much. (A few solutions come to rest on the wall
+    some time, which forgets everything: minus infinity; they are left out on both sides.)"""
     x, v = np.random.default_rng(1).uniform([[-0.6], [0.0]], [[-0.4], [0.2]], (2, 2048))
     mine, error = largest(Stopped(), Motion(jnp.asarray(x), jnp.asarray(v)), 100, 1700)
     theirs, other = largest_exponent(ImpactOscillator(1.0, 2.825, 0.02, 0.8), 2048, 100, 1700, steps=24)

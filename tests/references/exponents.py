@@ -117,6 +117,12 @@ def _cubic(g0, r0, g1, r1, h, s):
 INSIDE = np.linspace(0, 1, 12)[1:-1, None]
 
 
+def mean_of_finite(rates):
+    """The mean, and its standard error, of solutions that never come to rest, which are nearly all."""
+    rates = rates[np.isfinite(rates)]
+    return rates.mean(), rates.std(ddof=1) / np.sqrt(len(rates))
+
+
 def largest_exponent(system, lanes, transient, span, steps=48, seed=0):
     """The mean of the largest exponent over `lanes` solutions and `span` periods each, and its standard error."""
     rng = np.random.default_rng(seed)
@@ -131,14 +137,23 @@ def largest_exponent(system, lanes, transient, span, steps=48, seed=0):
         if n >= transient:
             logs.append(np.log(size))
     rates = np.mean(logs, axis=0) / system.period
-    return rates.mean(), rates.std(ddof=1) / np.sqrt(lanes)
+    return mean_of_finite(rates)
+
+
+def after(system, x, v, periods, steps=48):
+    """The states `periods` later."""
+    x, v, mode = np.array(x), np.array(v), np.zeros(len(x), int)
+    h = system.period / steps
+    for k in range(periods * steps):
+        x, v, mode, *_ = _across(system, k % steps * h, h, x, v, mode, np.zeros_like(x), np.zeros_like(x))
+    return x, v
 
 
 def _across(system, begin, h, x, v, mode, p, q):
     """One step, in pieces where there are events."""
     t, left = np.full_like(x, begin), np.full_like(x, h)
     active = np.arange(len(x))
-    for _ in range(100):  # impacts that lead to rest are not of these systems
+    for _ in range(100):  # impacts that lead to rest are not followed
         if not len(active):
             return x, v, mode, p, q
         here = t[active], x[active], v[active], mode[active]
@@ -159,7 +174,8 @@ def _across(system, begin, h, x, v, mode, p, q):
         x[active], v[active], mode[active], p[active], q[active] = x1, v1, mode1, p1, q1
         t[active], left[active] = t1, left[active] - tau
         active = active[event & (left[active] > 0)]
-    raise ArithmeticError("events without end")
+    x[active] = np.nan
+    return x, v, mode, p, q
 
 
 def _root(system, here, tau, inside):
