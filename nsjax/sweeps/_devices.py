@@ -5,20 +5,22 @@ import queue
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 import jax
+import jax.numpy as jnp
 from jax.sharding import Mesh
 
 
-Devices = int | Sequence[jax.Device] | Mesh
+Device: TypeAlias = Any  # a `jax.Device`, which is a variable to type checkers
+Devices: TypeAlias = int | Sequence[Device] | Mesh
 
 
-def devices_of(devices: Devices | None) -> list[jax.Device]:
+def devices_of(devices: Devices | None) -> list[Device]:
     """Those of this process; None is the default one."""
     local = jax.local_devices()
     if devices is None:
-        return [_default()]
+        return list(jnp.zeros(()).devices())
     if isinstance(devices, Mesh):
         found = list(devices.devices.flat)
     elif isinstance(devices, bool) or not isinstance(devices, int | list | tuple):
@@ -47,11 +49,6 @@ def devices_of(devices: Devices | None) -> list[jax.Device]:
     return found
 
 
-def _default() -> jax.Device:
-    device = jax.config.jax_default_device
-    return device if isinstance(device, jax.Device) else jax.local_devices(backend=device)[0]
-
-
 class DeviceQueue:
     """A thread for each device, which takes one piece of work after the other. (While it computes, XLA lets go of
     Python's lock.)
@@ -66,8 +63,8 @@ class DeviceQueue:
     Where the `with` block is left, what was not begun is not done any more.
     """
 
-    def __init__(self, devices: Sequence[jax.Device]):
-        self._todo: queue.SimpleQueue[tuple[Future, Callable[[jax.Device], Any]] | None] = queue.SimpleQueue()
+    def __init__(self, devices: Sequence[Device]):
+        self._todo: queue.SimpleQueue[tuple[Future, Callable[[Device], Any]] | None] = queue.SimpleQueue()
         self._threads = [threading.Thread(target=self._work, args=(device,), daemon=True) for device in devices]
 
     def __enter__(self) -> Self:
@@ -75,12 +72,16 @@ class DeviceQueue:
             thread.start()
         return self
 
-    def submit(self, work: Callable[[jax.Device], Any]) -> Future:
+    def __len__(self) -> int:
+        """The number of devices."""
+        return len(self._threads)
+
+    def submit(self, work: Callable[[Device], Any]) -> Future:
         future: Future = Future()
         self._todo.put((future, work))
         return future
 
-    def _work(self, device: jax.Device) -> None:
+    def _work(self, device: Device) -> None:
         while (item := self._todo.get()) is not None:
             future, work = item
             if not future.set_running_or_notify_cancel():

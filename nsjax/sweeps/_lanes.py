@@ -24,6 +24,16 @@ class Lanes(NamedTuple):
         """What is mapped, of some lanes."""
         return jax.tree.map(lambda x: x[start:stop], self.mapped)
 
+    def on_host(self) -> "Lanes":
+        """To take rows from while devices are busy."""
+        keys = jax.dtypes.extended
+        there = jax.tree.map(lambda x: x if jnp.issubdtype(x.dtype, keys) else _array(x), self.mapped)
+        return self._replace(mapped=there)
+
+
+def _array(x: Any) -> np.ndarray:
+    return x if isinstance(x, np.ndarray) else np.asarray(x)  # (what is on the disk stays a `numpy.memmap`)
+
 
 def lanes_of(args: Any) -> Lanes:
     """Nothing is copied: an array on the disk stays there."""

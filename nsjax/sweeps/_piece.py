@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._numerics._compile import without_collection
+from ._devices import Device
 from ._lanes import Lanes
 
 
@@ -21,7 +22,7 @@ class Piece:
     whichever device, thread or process it falls to, and whatever was done before.
     """
 
-    def __init__(self, fn: Callable[..., Any], lanes: Lanes, chunk: int, chunks: int, devices: Sequence[jax.Device]):
+    def __init__(self, fn: Callable[..., Any], lanes: Lanes, chunk: int, chunks: int, devices: Sequence[Device]):
         self.chunk, self.size = chunk, chunk * chunks
         # What is traced is the same for all pieces; it is brought to each device once.
         self.shared, static = eqx.partition((fn, lanes.rest), eqx.is_array)
@@ -33,11 +34,14 @@ class Piece:
         self.consts, self.lowered = traced[0].jaxpr.consts, lowered[0]
         out, self.tree = jax.tree.flatten(lowered[0].out_info)
         self.forms = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in out]
+        if any(jnp.issubdtype(form.dtype, jax.dtypes.extended) for form in self.forms):
+            raise TypeError("What `fn` returns must be numbers: of a random key return `jax.random.key_data(key)`.")
+        self.platform = devices[0].platform
         self._lowered = dict(zip(devices, lowered))
-        self._compiled: dict[jax.Device, tuple[Any, Any]] = {}
+        self._compiled: dict[Device, tuple[Any, Any]] = {}
         self._locks = {device: threading.Lock() for device in devices}
 
-    def _forms(self, mapped: Any, device: jax.Device) -> tuple[Any, Any, Any]:
+    def _forms(self, mapped: Any, device: Device) -> tuple[Any, Any, Any]:
         place = jax.sharding.SingleDeviceSharding(device)
 
         def form(x: Any, rows: int | None = None) -> jax.ShapeDtypeStruct:
@@ -48,7 +52,7 @@ class Piece:
         pieces = jax.tree.map(lambda x: form(x, self.size), mapped)
         return jax.tree.map(form, self.shared), pieces, form(jnp.zeros((), jnp.int32))
 
-    def _on(self, device: jax.Device) -> tuple[Any, Any]:
+    def _on(self, device: Device) -> tuple[Any, Any]:
         """The compiled program, and what it shares with all pieces."""
         with self._locks[device]:
             if device not in self._compiled:
@@ -56,7 +60,7 @@ class Piece:
                 self._compiled[device] = compiled, jax.device_put(self.shared, device)
             return self._compiled[device]
 
-    def run(self, mapped: Any, device: jax.Device) -> list[np.ndarray]:
+    def run(self, mapped: Any, device: Device) -> list[np.ndarray]:
         """The leaves of what `fn` returns, for up to `size` lanes."""
         number = len(jax.tree.leaves(mapped)[0])
         compiled, shared = self._on(device)

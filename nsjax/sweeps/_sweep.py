@@ -86,7 +86,7 @@ def _handed_out(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices
     chunks, chunk = even_chunks(lanes.number, chunk)
     if not lanes.number:
         return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, 1)
-    piece = Piece(fn, lanes, chunk, min(MOST, -(-chunks // PIECES)), found)
+    piece, lanes = Piece(fn, lanes, chunk, min(MOST, -(-chunks // PIECES)), found), lanes.on_host()
     out = [np.empty((lanes.number, *form.shape), form.dtype) for form in piece.forms]
     starts = range(0, lanes.number, piece.size)
     with DeviceQueue(found) as each:
