@@ -73,7 +73,7 @@ class Claims:
 
     def __init__(self, folder: pathlib.Path, owner: Owner, stale: float, gone: Any):
         self.folder, self.owner, self.stale, self._gone = folder, owner, stale, gone
-        self._clock = folder / f"{uuid.uuid4().hex}.clock"
+        self._clock = folder / f"{owner.token}.{uuid.uuid4().hex[:12]}.clock"
         self._own: set[int] = set()
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._keep_fresh, daemon=True)

@@ -34,9 +34,11 @@ class Folder:
             with self._written(place, first=True) as file:
                 file.write(json.dumps(header, indent=1).encode())
         try:
-            return json.loads(place.read_bytes())
-        except ValueError as error:
+            found = json.loads(place.read_bytes())
+            _ = [found[key] for key in header]
+        except (ValueError, TypeError, LookupError) as error:
             raise ValueError(f"The file {place} is damaged, or nsjax did not write it.") from error
+        return found
 
     @contextlib.contextmanager
     def _written(self, place: pathlib.Path, first: bool = False) -> Iterator[Any]:
@@ -56,10 +58,10 @@ class Folder:
         _sync(place.parent)
 
     def sweep_up(self, token: str) -> None:
-        """Removes what a process that is no more left half written."""
-        for folder in (self.blocks, self.path / "result"):
-            for part in folder.glob(f"*.{token}.part"):
-                part.unlink(missing_ok=True)
+        """Removes what a process that is no more left half done."""
+        for pattern in (f"blocks/*.{token}.part", f"result/*.{token}.part", f"claims/{token}.*.clock"):
+            for left in self.path.glob(pattern):
+                left.unlink(missing_ok=True)
 
     def block(self, number: int) -> pathlib.Path:
         return self.blocks / f"{number:08d}.npz"

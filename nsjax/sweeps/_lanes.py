@@ -20,9 +20,9 @@ class Lanes(NamedTuple):
     rest: Any
     number: int
 
-    def rows(self, start: int, stop: int) -> Any:
+    def rows(self, which: slice | np.ndarray) -> Any:
         """What is mapped, of some lanes."""
-        return jax.tree.map(lambda x: x[start:stop], self.mapped)
+        return jax.tree.map(lambda x: x[which], self.mapped)
 
     def on_host(self) -> "Lanes":
         """To take rows from while devices are busy."""

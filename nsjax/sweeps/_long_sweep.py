@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from .._numerics._compile import eager
 from .._numerics._text import known, positive, shown
 from ._claim import Claims, myself
 from ._dataset import dataset, leaf_names
@@ -66,6 +67,10 @@ class Sweep:
     - `chunk`: how many lanes go together, by default 256 on a CPU and a block on other devices.
     - `devices`: a number of devices, a list of them, or a `jax.sharding.Mesh`, of this process; by default one. The
         result does not depend on it.
+    - `order`: numbers, shape `(lanes,)`, by which the lanes of a block are sorted while they are computed: a guess of
+        how long each takes, or a parameter that tells. Lanes of a chunk wait for the slowest of them, so that this pays
+        where neighbours are not alike, as in a random sample (`benchmarks/sweep_scale.py`). What is returned is in its
+        own order, and does not depend on it.
     - `progress`: whether to write to the standard error stream how far it is, how many lanes it does in a second and
         how long it will take; or a function, which is given a `Status` after each block.
     - `stale`: for how long a block is left to another process that gives no sign of life [s]. (Of a process on the same
@@ -84,21 +89,25 @@ class Sweep:
         block: int = BLOCK,
         chunk: int | None = None,
         devices: Devices | None = None,
+        order: Any = None,
         progress: Progress = False,
         stale: float = 120.0,
     ):
+        if not (eager() and known((fn, args))):
+            raise ValueError("`nsjax.Sweep` is not for `jax.jit`, `jax.vmap` and derivatives: use `nsjax.sweep`.")
+        positive("block", block)
         self._devices = devices_of(devices)
         if chunk is None:
             chunk = min(block, default_chunk(block, self._devices[0].platform))
         positive("chunk", chunk)
-        positive("block", block)
         if block % chunk:
             raise ValueError(f"Argument `block` must be a multiple of `chunk` = {chunk}, but is {block}.")
         if not (stale > 0):
             raise ValueError(f"Argument `stale` must be a positive time [s], but is {stale!r}.")
         lanes = lanes_of(args)
-        if not known((fn, lanes)):
-            raise ValueError("`nsjax.Sweep` is not for `jax.jit`, `jax.vmap` and derivatives: use `nsjax.sweep`.")
+        if order is not None and np.shape(order) != (lanes.number,):
+            raise ValueError(f"Argument `order` must have shape ({lanes.number},), but has {np.shape(order)}.")
+        self._order = order if order is None or isinstance(order, np.ndarray) else np.asarray(order)
         self._fn, self._progress, self._stale = fn, progress, stale
         self._block, self._number = block, -(-lanes.number // block)
         self._piece = Piece(fn, lanes, chunk, min(MOST, block // chunk), self._devices)
@@ -173,7 +182,7 @@ class Sweep:
             todo = sorted(set(range(self._number)) - done)
             with Meter(self._progress, lambda: self.status) as meter, self._claims as claims:
                 with DeviceQueue(self._devices) as each:
-                    work = Work(self._piece, self._lanes, self._block, self._folder, claims, each)
+                    work = Work(self._piece, self._lanes, self._block, self._folder, claims, each, order=self._order)
                     yield from work.completed(todo, meter, wait)
 
     # What was found.

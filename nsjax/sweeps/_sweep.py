@@ -91,8 +91,7 @@ def _handed_out(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices
     starts = range(0, lanes.number, piece.size)
     with DeviceQueue(found) as each:
         futures = [
-            each.submit(lambda device, i=i: piece.run(lanes.rows(i, min(i + piece.size, lanes.number)), device))
-            for i in starts
+            each.submit(lambda device, i=i: piece.run(lanes.rows(slice(i, i + piece.size)), device)) for i in starts
         ]
         for start, future in zip(starts, futures):
             for whole, part in zip(out, future.result()):

@@ -22,6 +22,7 @@ class _Job(NamedTuple):
     """A block that is being computed."""
 
     number: int
+    rows: np.ndarray | None  # in which order its lanes are computed; None for their own
     pieces: list[tuple[int, Future]]  # of so many lanes
 
     @property
@@ -30,15 +31,34 @@ class _Job(NamedTuple):
 
     @property
     def leaves(self) -> list[np.ndarray]:
-        return [np.concatenate(parts) for parts in zip(*(future.result() for _, future in self.pieces))]
+        found = [np.concatenate(parts) for parts in zip(*(future.result() for _, future in self.pieces))]
+        if self.rows is not None:
+            back = np.argsort(self.rows)
+            found = [leaf[back] for leaf in found]
+        return found
 
 
 class Work:
     """Computes the blocks that no other process does. While one is written the next one is under way, so that no device
-    has to wait."""
+    has to wait.
 
-    def __init__(self, piece: Piece, lanes: Lanes, block: int, folder: Folder, claims: Claims, devices: DeviceQueue):
-        self.piece, self.lanes, self.block = piece, lanes, block
+    **Arguments:**
+
+    - `order`: numbers, one a lane, by which the lanes of a block are sorted while they are computed; or None.
+    """
+
+    def __init__(
+        self,
+        piece: Piece,
+        lanes: Lanes,
+        block: int,
+        folder: Folder,
+        claims: Claims,
+        devices: DeviceQueue,
+        *,
+        order: np.ndarray | None = None,
+    ):
+        self.piece, self.lanes, self.block, self.order = piece, lanes, block, order
         self.folder, self.claims, self.devices = folder, claims, devices
 
     def completed(self, todo: list[int], meter: Meter, wait: bool) -> Iterator[int]:
@@ -92,8 +112,10 @@ class Work:
 
     def _job(self, number: int) -> _Job:
         start, stop = number * self.block, min((number + 1) * self.block, self.lanes.number)
+        rows = None if self.order is None else np.argsort(self.order[start:stop], kind="stable")
         cuts = [(i, min(i + self.piece.size, stop)) for i in range(start, stop, self.piece.size)]
-        return _Job(number, [(j - i, self.devices.submit(self._piece(i, j))) for i, j in cuts])
+        each = [slice(*cut) if rows is None else start + rows[cut[0] - start : cut[1] - start] for cut in cuts]
+        return _Job(number, rows, [(j - i, self.devices.submit(self._piece(own))) for (i, j), own in zip(cuts, each)])
 
-    def _piece(self, start: int, stop: int) -> Callable[[Device], Any]:
-        return lambda device: self.piece.run(self.lanes.rows(start, stop), device)
+    def _piece(self, rows: slice | np.ndarray) -> Callable[[Device], Any]:
+        return lambda device: self.piece.run(self.lanes.rows(rows), device)

@@ -1,0 +1,82 @@
+"""`sweep` and `Sweep` on two devices: the same bits as on one, and results where they belong."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from nsjax import sweep
+from nsjax.sweeps._devices import DeviceQueue, devices_of
+
+
+SCRIPT = pathlib.Path(__file__).parents[1] / "references" / "sweep_process.py"
+
+
+def test_two_devices(tmp_path):
+    """All in one process, as JAX has to be told how many devices there are before it begins."""
+    # (It stands in the folder of references, and finds nsjax as this process does.)
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, str(SCRIPT), "devices", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, env=env)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["number"] == 2
+
+    ways = ["one", "two", "list", "small pieces", "folder, first", "folder, both"]
+    ways += [f"uneven, {mesh}" for mesh in ("explicit", "automatic")]
+    assert {name: found[name] for name in ways} == dict.fromkeys(ways, found["plain"])
+    ways = [f"even, {how}, {mesh}" for how in ("mesh", "spread", "jit") for mesh in ("explicit", "automatic")]
+    assert {name: found[name] for name in ways} == dict.fromkeys(ways, found["even"])
+    assert len(found["places"]) == 6 and all(place.startswith("P('lanes',") for place in found["places"].values())
+
+    assert found["derivatives"] < 1e-12
+    errors = found["errors"]
+    for where in ("within jit", "within derivatives"):
+        assert "must be a `jax.sharding.Mesh` within `jax.jit`, `jax.vmap` and derivatives, but is 2" in errors[where]
+    assert "from 1 to 2, but is 3" in errors["too many"] and "jax_num_cpu_devices" in errors["too many"]
+    assert errors["the function's"] == "KeyError: 'mine'"
+
+
+def test_what_devices_may_be():
+    (device,) = jax.devices()
+    mesh = jax.make_mesh((1,), ("lanes",))
+    assert devices_of(None) == devices_of(1) == devices_of([device]) == devices_of(mesh) == [device]
+    for wrong in (0, 2, -1):
+        with pytest.raises(ValueError, match=f"`devices` must be a number from 1 to 1, but is {wrong}"):
+            devices_of(wrong)
+    for wrong in (True, 1.0, "cpu", [], ["cpu"]):
+        with pytest.raises(TypeError, match="Argument `devices` must"):
+            devices_of(wrong)
+    with pytest.raises(ValueError, match="different devices"):
+        devices_of([device, device])
+
+
+def test_derivatives_within_what_is_swept():
+    x = jnp.linspace(0.1, 2.0, 10)
+    found = sweep(jax.value_and_grad(jnp.sin), x, chunk=4, devices=1)
+    assert jnp.array_equal(found[0], sweep(jnp.sin, x, chunk=4)) and jnp.allclose(found[1], jnp.cos(x))
+    with pytest.raises(ValueError, match=r"nsjax.sweep\(jax.jacfwd\(fn\), x, devices=n\)"):
+        jax.grad(lambda k: jnp.sum(sweep(lambda x: k * x, x, devices=1)))(1.0)
+
+
+def test_a_queue_ends_with_the_first_error():
+    """What was begun is finished, and the rest is never begun."""
+    begun = []
+
+    def work(i):
+        begun.append(i)
+        if i == 2:
+            raise RuntimeError("third")
+        return i
+
+    with pytest.raises(RuntimeError, match="third"), DeviceQueue(jax.devices()) as each:
+        assert len(each) == 1
+        futures = [each.submit(lambda device, i=i: work(i)) for i in range(3)]
+        assert [future.result() for future in futures[:2]] == [0, 1]
+        futures[2].result()
+    assert begun == [0, 1, 2]
