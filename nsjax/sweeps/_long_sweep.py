@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Self
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .._numerics._compile import eager
@@ -16,10 +17,11 @@ from ._dataset import dataset, leaf_names
 from ._devices import DeviceQueue, Devices, devices_of
 from ._fingerprint import differences, fingerprint
 from ._folder import Folder
-from ._lanes import default_chunk, lanes_of
+from ._lanes import CHUNK, default_chunk, lanes_of
 from ._outcomes import Outcome, outcome_of
 from ._piece import Piece
 from ._progress import Meter, Progress, Status
+from ._sweep import sweep
 from ._work import Work
 
 
@@ -110,14 +112,16 @@ class Sweep:
         self._order = order if order is None or isinstance(order, np.ndarray) else np.asarray(order)
         self._fn, self._progress, self._stale = fn, progress, stale
         self._block, self._number = block, -(-lanes.number // block)
-        self._piece = Piece(fn, lanes, chunk, min(MOST, block // chunk), self._devices)
+        chunk = max(1, min(chunk, lanes.number))  # of few lanes there are no more in a chunk
+        chunks = -(-min(block, max(1, lanes.number)) // chunk)
+        self._piece = Piece(fn, lanes, chunk, min(MOST, chunks), self._devices)
         self._lanes = lanes.on_host()
         self._owner = myself()
         self._folder = Folder(path, self._owner.token)
-        strange = {form.dtype.name for form in self._piece.forms if form.dtype.kind not in "biufc"}
+        strange = {form.dtype.name for form in self._piece.program.forms if form.dtype.kind not in "biufc"}
         if strange:
             raise TypeError(f"What `fn` returns must be numbers that NumPy knows, but there is {', '.join(strange)}.")
-        names = leaf_names(self._tree(range(self._piece.tree.num_leaves)), "value")
+        names = leaf_names(self._tree(range(self._piece.program.tree.num_leaves)), "value")
         here = fingerprint(fn, self._lanes, self._piece, block, names)
         apart = differences(self._folder.open(here), here)
         if apart:
@@ -127,7 +131,7 @@ class Sweep:
             )
 
     def _tree(self, leaves: Any) -> Any:
-        return jax.tree.unflatten(self._piece.tree, leaves)
+        return jax.tree.unflatten(self._piece.program.tree, leaves)
 
     def _span(self, number: int) -> tuple[int, int]:
         return number * self._block, min((number + 1) * self._block, self._lanes.number)
@@ -171,7 +175,7 @@ class Sweep:
             yield self._read(number)
 
     def _read(self, number: int) -> Block:
-        leaves = [self._folder.read(number, i) for i in range(len(self._piece.forms))]
+        leaves = [self._folder.read(number, i) for i in range(len(self._piece.program.forms))]
         return Block(number, *self._span(number), self._tree(leaves))
 
     def _completed(self, wait: bool) -> Iterator[int]:
@@ -200,7 +204,7 @@ class Sweep:
         return self._tree(
             [
                 self._folder.whole(i, (count, *form.shape), form.dtype, self._number)
-                for i, form in enumerate(self._piece.forms)
+                for i, form in enumerate(self._piece.program.forms)
             ]
         )
 
@@ -213,7 +217,7 @@ class Sweep:
 
         **Raises:** `ValueError` if `fn` returns none of `RESULTS`, or several.
         """
-        outcome, found = outcome_of(self._piece.tree), collections.Counter()
+        outcome, found = outcome_of(self._piece.program.tree), collections.Counter()
         for _, codes in self._codes(outcome):
             found.update(outcome.names(codes))
         return dict(found.most_common())
@@ -224,7 +228,7 @@ class Sweep:
 
         **Raises:** `ValueError` if `fn` returns none of `RESULTS`, or several.
         """
-        outcome = outcome_of(self._piece.tree)
+        outcome = outcome_of(self._piece.program.tree)
         rows = [start + np.flatnonzero(outcome.failed(codes)) for start, codes in self._codes(outcome)]
         at = np.concatenate([np.zeros(0, int), *rows])
         return eqx.combine(jax.tree.map(lambda x: x[at], self._lanes.mapped), self._lanes.rest)
@@ -233,3 +237,17 @@ class Sweep:
         """`result` as an `xarray.Dataset` over the dimension `lane`, with the arguments as coordinates. It needs the
         package xarray: `pip install nsjax[data]`."""
         return dataset(self._fn, self._lanes, self.result())
+
+
+def sweep_in(
+    path: str | os.PathLike | None,
+    fn: Callable[..., Any],
+    *args: Any,
+    chunk: int | None = None,
+    devices: Devices | None = None,
+) -> Any:
+    """`sweep`; with a `path` by a `Sweep` in that folder, a chunk at a time, as each lane is much work."""
+    if path is None:
+        return sweep(fn, *args, chunk=chunk, devices=devices)
+    runs = Sweep(fn, *args, path=path, block=chunk or CHUNK, chunk=chunk, devices=devices).run()
+    return jax.tree.map(jnp.asarray, runs.result())

@@ -1,5 +1,6 @@
 """A piece of a sweep: some chunks of lanes, by one program that is compiled once for each device."""
 
+import collections
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,58 +16,37 @@ from ._devices import Device
 from ._lanes import Lanes
 
 
+try:
+    from jax._src.config import trace_context
+except ImportError:  # then of all settings that a program depends on only the one that matters most is looked at
+    trace_context = None
+
+KEPT = 16  # programs
+
+
 class Piece:
-    """The program of a piece: up to `chunks` chunks of `chunk` lanes, as many as there are.
+    """Up to `chunks` chunks of `chunk` lanes, as many as there are.
 
     The program does not know how many lanes there are in all, nor who computes the others. So a lane has the same bits
     whichever device, thread or process it falls to, and whatever was done before.
     """
 
     def __init__(self, fn: Callable[..., Any], lanes: Lanes, chunk: int, chunks: int, devices: Sequence[Device]):
-        self.chunk, self.size = chunk, chunk * chunks
-        # What is traced is the same for all pieces; it is brought to each device once.
-        self.shared, static = eqx.partition((fn, lanes.rest), eqx.is_array)
-        program = jax.jit(_program(static, chunk, chunks))
-        with without_collection():
-            # Lowered here and not in the threads, which do not see settings that are made by `with jax.enable_x64():`.
-            traced = [program.trace(*self._forms(lanes.mapped, device)) for device in devices]
-            lowered = [one.lower() for one in traced]
-        self.consts, self.lowered = traced[0].jaxpr.consts, lowered[0]
-        out, self.tree = jax.tree.flatten(lowered[0].out_info)
-        self.forms = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in out]
-        if any(jnp.issubdtype(form.dtype, jax.dtypes.extended) for form in self.forms):
-            raise TypeError("What `fn` returns must be numbers: of a random key return `jax.random.key_data(key)`.")
-        self.platform = devices[0].platform
-        self._lowered = dict(zip(devices, lowered))
-        self._compiled: dict[Device, tuple[Any, Any]] = {}
-        self._locks = {device: threading.Lock() for device in devices}
-
-    def _forms(self, mapped: Any, device: Device) -> tuple[Any, Any, Any]:
-        place = jax.sharding.SingleDeviceSharding(device)
-
-        def form(x: Any, rows: int | None = None) -> jax.ShapeDtypeStruct:
-            aval = jax.typeof(x if rows is None else x[:0])
-            shape = aval.shape if rows is None else (rows, *aval.shape[1:])
-            return jax.ShapeDtypeStruct(shape, aval.dtype, sharding=place, weak_type=aval.weak_type)
-
-        pieces = jax.tree.map(lambda x: form(x, self.size), mapped)
-        return jax.tree.map(form, self.shared), pieces, form(jnp.zeros((), jnp.int32))
-
-    def _on(self, device: Device) -> tuple[Any, Any]:
-        """The compiled program, and what it shares with all pieces."""
-        with self._locks[device]:
-            if device not in self._compiled:
-                compiled = self._lowered.pop(device).compile()
-                self._compiled[device] = compiled, jax.device_put(self.shared, device)
-            return self._compiled[device]
+        self.chunk, self.size, self.platform = chunk, chunk * chunks, devices[0].platform
+        # What is the same for all pieces is brought to each device once.
+        self._shared, static = eqx.partition((fn, lanes.rest), eqx.is_array)
+        self._there: dict[Device, Any] = {}
+        self.program = _program_for(static, self._shared, lanes.mapped, chunk, chunks, tuple(devices))
 
     def run(self, mapped: Any, device: Device) -> list[np.ndarray]:
-        """The leaves of what `fn` returns, for up to `size` lanes."""
+        """The leaves of what `fn` returns, for up to `size` lanes. Each device has a thread that calls it."""
         number = len(jax.tree.leaves(mapped)[0])
-        compiled, shared = self._on(device)
+        compiled = self.program.on(device)
+        if device not in self._there:
+            self._there[device] = jax.device_put(self._shared, device)
         full = jax.tree.map(lambda x: jax.device_put(_filled(x, self.size), device), mapped)
         count = jax.device_put(np.int32(-(-number // self.chunk)), device)
-        return [np.asarray(x)[:number] for x in jax.tree.leaves(compiled(shared, full, count))]
+        return [np.asarray(x)[:number] for x in jax.tree.leaves(compiled(self._there[device], full, count))]
 
 
 def _filled(x: Any, size: int) -> Any:
@@ -78,8 +58,81 @@ def _filled(x: Any, size: int) -> Any:
     return join([x, *[x[-1:]] * short])
 
 
-def _program(static: Any, chunk: int, chunks: int) -> Callable[..., Any]:
-    def program(shared: Any, mapped: Any, count: Any) -> Any:
+class Program:
+    """What is compiled.
+
+    **Attributes:**
+
+    - `text`, `consts`: it, and the arrays that it holds.
+    - `tree`, `forms`: the structure of what `fn` returns, and the shapes and dtypes of its leaves for one lane.
+    """
+
+    def __init__(self, function: Callable[..., Any], forms: Any, devices: Sequence[Device]):
+        def placed(device: Device) -> Any:
+            place = jax.sharding.SingleDeviceSharding(device)
+            kind = jax.ShapeDtypeStruct
+            return jax.tree.map(lambda x: kind(x.shape, x.dtype, sharding=place, weak_type=x.weak_type), forms)
+
+        jitted = jax.jit(function)
+        with without_collection():
+            # Lowered here and not in the threads, which do not see settings that are made by `with jax.enable_x64():`.
+            traced = [jitted.trace(*placed(device)) for device in devices]
+            lowered = [one.lower() for one in traced]
+        self.consts, self._first = traced[0].jaxpr.consts, lowered[0]
+        out, self.tree = jax.tree.flatten(lowered[0].out_info)
+        self.forms = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in out]
+        if any(jnp.issubdtype(form.dtype, jax.dtypes.extended) for form in self.forms):
+            raise TypeError("What `fn` returns must be numbers: of a random key return `jax.random.key_data(key)`.")
+        self._lowered = dict(zip(devices, lowered))
+        self._compiled: dict[Device, Any] = {}
+        self._locks = {device: threading.Lock() for device in devices}
+
+    @property
+    def text(self) -> str:
+        return self._first.as_text()
+
+    def on(self, device: Device) -> Any:
+        """Compiled for a device, on the first call."""
+        with self._locks[device]:
+            if device not in self._compiled:
+                self._compiled[device] = self._lowered.pop(device).compile()
+            return self._compiled[device]
+
+
+_kept: collections.OrderedDict[Any, Program] = collections.OrderedDict()
+
+
+def _program_for(
+    static: Any, shared: Any, mapped: Any, chunk: int, chunks: int, devices: tuple[Device, ...]
+) -> Program:
+    """The one of an earlier call, where all is the same, as `jax.jit` would have it."""
+
+    def form(x: Any) -> jax.ShapeDtypeStruct:
+        aval = jax.typeof(x)
+        return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type)
+
+    def rows(x: Any) -> jax.ShapeDtypeStruct:
+        one = form(x[:0])
+        return jax.ShapeDtypeStruct((chunk * chunks, *one.shape[1:]), one.dtype, weak_type=one.weak_type)
+
+    forms = jax.tree.map(form, shared), jax.tree.map(rows, mapped), form(np.int32(0))
+    (own, own_tree), (flat, tree) = jax.tree.flatten(static), jax.tree.flatten(forms)
+    types = tuple((x.shape, x.dtype, x.weak_type) for x in flat)
+    # (Of a number with its type: True is 1, and another program.)
+    settings = trace_context() if trace_context is not None else jnp.result_type(float)
+    key = tuple((type(x), x) for x in own), own_tree, types, tree, chunk, chunks, devices, settings
+    try:
+        found = _kept.pop(key, None)
+    except TypeError:  # the function holds what cannot be compared
+        return Program(_function(static, chunk, chunks), forms, devices)
+    _kept[key] = found or Program(_function(static, chunk, chunks), forms, devices)
+    while len(_kept) > KEPT:
+        _kept.popitem(last=False)
+    return _kept[key]
+
+
+def _function(static: Any, chunk: int, chunks: int) -> Callable[..., Any]:
+    def piece(shared: Any, mapped: Any, count: Any) -> Any:
         fn, rest = eqx.combine(shared, static)
         # (As a program of its own it is traced once, though it is asked for its shapes first.)
         lanes = jax.jit(jax.vmap(lambda mapped: fn(*eqx.combine(mapped, rest))))
@@ -98,4 +151,4 @@ def _program(static: Any, chunk: int, chunks: int) -> Callable[..., Any]:
         out = jax.tree.map(lambda x: jnp.zeros((chunk * chunks, *x.shape[1:]), x.dtype), form)
         return lax.fori_loop(0, count, further, out)
 
-    return program
+    return piece

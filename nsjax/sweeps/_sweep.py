@@ -86,8 +86,10 @@ def _handed_out(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices
     chunks, chunk = even_chunks(lanes.number, chunk)
     if not lanes.number:
         return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, 1)
-    piece, lanes = Piece(fn, lanes, chunk, min(MOST, -(-chunks // PIECES)), found), lanes.on_host()
-    out = [np.empty((lanes.number, *form.shape), form.dtype) for form in piece.forms]
+    together = min(MOST, -(-chunks // PIECES))
+    found = found[: -(-chunks // together)]  # a device without a piece needs no program
+    piece, lanes = Piece(fn, lanes, chunk, together, found), lanes.on_host()
+    out = [np.empty((lanes.number, *form.shape), form.dtype) for form in piece.program.forms]
     starts = range(0, lanes.number, piece.size)
     with DeviceQueue(found) as each:
         futures = [
@@ -96,4 +98,4 @@ def _handed_out(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices
         for start, future in zip(starts, futures):
             for whole, part in zip(out, future.result()):
                 whole[start : start + len(part)] = part
-    return jax.tree.unflatten(piece.tree, [jnp.asarray(x) for x in out])
+    return jax.tree.unflatten(piece.program.tree, [jnp.asarray(x) for x in out])

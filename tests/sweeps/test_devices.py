@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from nsjax import sweep
+from nsjax import Sweep, sweep
 from nsjax.sweeps._devices import DeviceQueue, devices_of
 
 
@@ -62,6 +62,30 @@ def test_derivatives_within_what_is_swept():
     assert jnp.array_equal(found[0], sweep(jnp.sin, x, chunk=4)) and jnp.allclose(found[1], jnp.cos(x))
     with pytest.raises(ValueError, match=r"nsjax.sweep\(jax.jacfwd\(fn\), x, devices=n\)"):
         jax.grad(lambda k: jnp.sum(sweep(lambda x: k * x, x, devices=1)))(1.0)
+
+
+def test_one_program_for_many_calls(tmp_path):
+    """As `jax.jit` has it: other values, and an object that goes on with a sweep, trace and compile nothing."""
+    traced = []
+
+    def fn(x, k, n):
+        traced.append(1)
+        return k * x + (1 if n is True else 0)
+
+    x = jnp.arange(10.0)
+    for k in (1.0, 2.0):
+        assert jnp.array_equal(sweep(fn, x, k, 1, chunk=4, devices=1), k * x)
+    assert len(traced) == 1
+    assert jnp.array_equal(sweep(fn, x, 2.0, True, chunk=4, devices=1), 2 * x + 1)  # though 1 == True
+    assert len(traced) == 2
+    sweep(fn, x, 2.0, 1, chunk=4, devices=1)
+    assert len(traced) == 2
+    for _ in range(2):
+        Sweep(fn, x, 2.0, 1, path=tmp_path, block=5, chunk=5).run()
+    assert len(traced) == 3
+    with jax.enable_x64(False):
+        narrow = sweep(fn, x.astype("float32"), 2.0, 1, chunk=4, devices=1)
+        assert narrow.dtype == "float32" and jnp.array_equal(narrow, 2 * x.astype("float32"))
 
 
 def test_a_queue_ends_with_the_first_error():
