@@ -144,6 +144,10 @@ CASES = {
     "a sensitivity": (sensitivity(True), 5, "sensitivity\n", "derivative  x = 0.3, v[0] = 1, v[1] = 1, v[2] = 1"),
     "none at a grazing": (sensitivity(False), 5, "sensitivity that is not defined\n", "belt -1 -> belt +0"),
     "sensitivities": (several(sensitivity(True), sensitivity(False)), 5, "2 sensitivities, 1 of them defined", "x = 0.3,"),
+    "how far a sweep is": (
+        nsjax.sweeps.Status(1000, 450, 10, 4, 1, 50.0, 11.0),
+        1, "450 of 1,000 lanes (45.0 %), 4 of 10 blocks, 1 running", "50 lanes/s, 11 s left",
+    ),
     "a table": (TABLE, 3, "| method | tolerance |", "| Tsit5 | 1e-06 | 1.0e-07 | 0.1 | 2.0 |"),
 }  # fmt: skip
 

@@ -117,10 +117,28 @@ def devices(folder):
     print(json.dumps(found), flush=True)
 
 
+def distributed(folder, address, number):
+    jax.distributed.initialize(address, 2, int(number))
+    x = values(1000)
+    want = np.asarray(nsjax.sweep(iterated, x, 1.5).values)
+    mesh = jax.make_mesh((4,), ("lanes",))
+    place = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("lanes"))
+    spread = jax.make_array_from_callback(x.shape, place, lambda index: x[index])
+    for found in nsjax.sweep(iterated, x, 1.5, devices=mesh), nsjax.sweep(iterated, spread, 1.5):
+        shards = found.values.addressable_shards
+        assert len(shards) == 2 and all(len(s.data) == 250 and np.array_equal(s.data, want[s.index]) for s in shards)
+    assert "holds devices of other processes" in failure(
+        lambda: nsjax.Sweep(iterated, x, 1.5, path=folder, devices=mesh)
+    )
+    runs = nsjax.Sweep(iterated, x, 1.5, path=folder, devices=jax.local_devices(), block=64, chunk=64).run()
+    assert np.array_equal(runs.result().values, want)
+    print("good", flush=True)
+
+
 if __name__ == "__main__":
     role, *rest = sys.argv[1:]
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_numpy_dtype_promotion", "strict")
-    if role == "devices":  # now or never
+    if role != "work":  # now or never
         jax.config.update("jax_num_cpu_devices", 2)
-    {"work": work, "devices": devices}[role](*rest)
+    {"work": work, "devices": devices, "distributed": distributed}[role](*rest)

@@ -3,6 +3,7 @@
 import json
 import os
 import pathlib
+import socket
 import subprocess
 import sys
 
@@ -17,14 +18,19 @@ from nsjax.sweeps._devices import DeviceQueue, devices_of
 SCRIPT = pathlib.Path(__file__).parents[1] / "references" / "sweep_process.py"
 
 
+def begin(*words):
+    """(It stands in the folder of references, and finds nsjax as this process does.)"""
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen([sys.executable, str(SCRIPT), *map(str, words)], env=env, **pipes)
+
+
 def test_two_devices(tmp_path):
     """All in one process, as JAX has to be told how many devices there are before it begins."""
-    # (It stands in the folder of references, and finds nsjax as this process does.)
-    env = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, str(SCRIPT), "devices", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, env=env)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    process = begin("devices", tmp_path)
+    out, errors = process.communicate()
+    assert process.returncode == 0, errors
+    found = json.loads(out)
     assert found["number"] == 2
 
     ways = ["one", "two", "list", "small pieces", "folder, first", "folder, both"]
@@ -40,6 +46,17 @@ def test_two_devices(tmp_path):
         assert "must be a `jax.sharding.Mesh` within `jax.jit`, `jax.vmap` and derivatives, but is 2" in errors[where]
     assert "from 1 to 2, but is 3" in errors["too many"] and "jax_num_cpu_devices" in errors["too many"]
     assert errors["the function's"] == "KeyError: 'mine'"
+
+
+@pytest.mark.slow
+def test_a_mesh_of_two_processes(tmp_path):
+    """A sweep in both at once, over all four devices; and in a folder, where each has its own."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    for process in [begin("distributed", tmp_path, address, i) for i in range(2)]:
+        out, errors = process.communicate(timeout=120)
+        assert process.returncode == 0 and "good" in out, errors
 
 
 def test_what_devices_may_be():
