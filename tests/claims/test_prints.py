@@ -182,7 +182,8 @@ def test_without_numbers(name):
 
 
 def test_all_public_results_are_in_the_table():
-    """`Solution` is in `test_mistakes`, continuations are in `test_orbit_growth` and `test_equilibrium_growth`."""
+    """`Solution` is in `test_mistakes`, continuations are in `test_orbit_growth` and `test_equilibrium_growth`, `Sweep` is
+    in `test_long_sweep`."""
     others = {
         "Method",
         "Segment",
@@ -190,6 +191,7 @@ def test_all_public_results_are_in_the_table():
         "EquilibriumContinuation",
         "OrbitContinuation",
         "System",
+        "Sweep",
         "Affine",
         "Exponential",
         "Taylor",
