@@ -3,8 +3,8 @@
     python benchmarks/sweep_scale.py --out benchmarks/sweep_scale.json
 
 Workload S1 by Dopri8 (`workloads.py`), and a cheap one: a tenth of it. What is compared is run in turns in one process
-of two devices, and ratios are medians of the ratios within a turn. Memory is the largest a process of its own came to, of
-which pages of files that are mapped are counted apart: the system takes those back when it needs them.
+of two devices, and ratios are medians of the ratios within a turn. Memory is the largest that a process of its own came
+to; pages of files that are mapped are in the second number only: the system takes those back when it needs them.
 """
 
 import argparse
@@ -21,13 +21,15 @@ from typing import Any
 
 import diffrax
 import jax
-import jax.numpy as jnp
 import numpy as np
 from sweep import machine, slider_lane
 from workloads import belt_velocities, SLIDER
 
 import nsjax
 from nsjax.gallery import Motion, thesis
+
+
+PARTS = ("overhead", "order", "chunks", "throughput", "memory")
 
 
 def heavy(v_dr: jax.Array) -> Any:
@@ -47,7 +49,7 @@ Way = Callable[[], Callable[[], Any]]  # prepares what is timed
 
 
 def in_turns(ways: dict[str, Way], repeats: int) -> dict[str, list[float]]:
-    for way in 3 * [*ways.values()]:  # it compiles for each device: with few pieces not all have one at first
+    for way in 2 * [*ways.values()]:  # it compiles for each device: with few pieces not all have one at first
         jax.block_until_ready(way()())
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(repeats):
@@ -165,20 +167,24 @@ def main() -> None:
     parser.add_argument("--chunks", type=int, nargs="+", default=[64, 128, 256, 512, 1024, 4096])
     parser.add_argument("--numbers", type=int, nargs="+", default=[10**i for i in range(7)])
     parser.add_argument("--memory", type=int, nargs="*", default=[100_000, 10_000_000])
+    parser.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS, help="others stay as they are in the file")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", help="where to write the numbers as JSON")
     args = parser.parse_args()
-    found: dict[str, Any] = {"machine": machine()}
+    found: dict[str, Any] = {}
+    if args.out and pathlib.Path(args.out).exists():
+        found = json.loads(pathlib.Path(args.out).read_text())
+    found["machine"] = machine()
     with tempfile.TemporaryDirectory() as root:
         parts = {
             "overhead": lambda: overhead(args.lanes, args.block, args.repeats, root),
-            "order": lambda: order(args.lanes, args.repeats),
-            "chunks": lambda: chunks(args.lanes, args.chunks, args.repeats),
+            "order": lambda: order(args.lanes // 2, args.repeats),
+            "chunks": lambda: chunks(args.lanes // 4, args.chunks, args.repeats),
             "throughput": lambda: throughput(args.numbers, args.repeats),
             "memory": lambda: memory(args.memory),
         }
-        for name, part in parts.items():
-            found[name] = part()
+        for name in args.parts:
+            found[name] = parts[name]()
             print(f"\n### {name}\n")
             for row in found[name]:
                 print(", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()

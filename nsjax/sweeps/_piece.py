@@ -125,10 +125,11 @@ def _program_for(
         found = _kept.pop(key, None)
     except TypeError:  # the function holds what cannot be compared
         return Program(_function(static, chunk, chunks), forms, devices)
-    _kept[key] = found or Program(_function(static, chunk, chunks), forms, devices)
+    program = found or Program(_function(static, chunk, chunks), forms, devices)
+    _kept[key] = program
     while len(_kept) > KEPT:
         _kept.popitem(last=False)
-    return _kept[key]
+    return program
 
 
 def _function(static: Any, chunk: int, chunks: int) -> Callable[..., Any]:

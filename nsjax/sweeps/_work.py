@@ -70,11 +70,12 @@ class Work:
         """
         others, last = [], len(self.devices)
         job = self._begin(todo, others)
-        while job is not None or (todo and wait):
-            if job is None:
-                time.sleep(PAUSE)
-                job = self._begin(todo, others)
-            else:
+        while True:
+            if others:
+                meter.block(0)
+                yield from others
+                others.clear()
+            if job is not None:
                 self._wait(job.pieces[:-last], meter)
                 # Each device has a last piece of this block, and the next one has to be there when they are done. It is
                 # not taken sooner, as other processes may have nothing left to do.
@@ -85,10 +86,11 @@ class Work:
                 meter.block(job.lanes)
                 yield job.number
                 job = ahead
-            if others:
-                meter.block(0)
-                yield from others
-                others.clear()
+            elif todo and wait:
+                time.sleep(PAUSE)
+                job = self._begin(todo, others)
+            elif not others:
+                return
 
     def _wait(self, pieces: list[tuple[int, Future]], meter: Meter) -> None:
         for lanes, future in pieces:

@@ -96,6 +96,24 @@ def test_blocks_are_yielded_as_they_are_done(tmp_path, finished, want):
     same(runs.result(), want)
 
 
+def test_blocks_that_others_do_meanwhile(finished, tmp_path, monkeypatch):
+    """They are yielded too: all of them at the beginning, or one while its process is waited for."""
+    shutil.copytree(finished._folder.path, tmp_path / "run")
+    runs = again(finished, tmp_path / "run")
+    with monkeypatch.context() as patched:
+        patched.setattr(runs._folder, "done", set)
+        assert sorted(block.number for block in runs) == list(range(6))
+    last = runs._folder.block(5)
+    aside = last.rename(tmp_path / "aside.npz")
+    other = Claims(runs._folder.claims, myself()._replace(host="another machine"), 60.0, None)
+    assert other.take(5)
+    timer = threading.Timer(0.3, lambda: aside.rename(last))
+    timer.start()
+    assert [block.number for block in runs] == list(range(6))
+    timer.join()
+    assert other.take(5) is False  # it was left to it
+
+
 def test_arguments_on_the_disk(tmp_path, finished):
     """Only what is computed is read; and they count by their values."""
     np.save(tmp_path / "x.npy", X)
