@@ -36,6 +36,11 @@ def outermost() -> bool:
     return True
 
 
+def eager() -> bool:
+    """Whether what is called now is executed at once, and no transformation of JAX is around it."""
+    return trace_ctx is None or isinstance(trace_ctx.trace, EvalTrace)
+
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 # The older emitters of XLA's CPU compiler take a third to a half off its time. In batches their programs are up to 1.4

@@ -88,6 +88,11 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
     return "" if near is None else f" Did you mean `{near}`?"
 
 
+def positive(name: str, value: Any) -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise ValueError(f"Argument `{name}` must be a positive integer, but got {value!r}.")
+
+
 def counted(names: Iterable[str]) -> str:
     """`60 stable, 4 unstable`."""
     values, numbers = np.unique(list(names), return_counts=True)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from .._types import Number, Scalar
 from ..mechanics import Backlash, Constant, Damper, Falling, Friction, Harmonic, Scene, SceneModel, Spring
+from ..mechanics._state import coordinates_type, State
 from ..system._clock import clock
 from ..system._impact import impact
 from ..system._relay import relay
@@ -248,17 +249,24 @@ class Neuron(System):
         return Potential(jnp.zeros_like(y.V) + self.V_r)
 
 
+def _at(**q: float) -> State:
+    """At rest, by the coordinates of a scene. (A scene has its masses checked by JAX, which then begins to compute, and
+    importing nsjax leaves it to the user to say on what devices.)"""
+    kind = coordinates_type(tuple(q))
+    return State(kind(**q), kind(*[0.0] * len(q)))
+
+
 _ENTRIES = (
     Entry(
         "block chain",
         "Chain of blocks on a belt",
         BlockChain,
-        y0=BlockChain().state({"x1": 2.0, "x2": 1.5, "x3": 1.0}),
+        y0=_at(x1=2.0, x2=1.5, x3=1.0),
         t1=60.0,
     ),
     Entry("brake squeal", "Pad of a brake, by mode coupling", BrakePad, y0=Pad(4.0, -2.0, 0.0, 0.0), t1=200.0),
-    Entry("gear rattle", "Pair of gears with play", GearPair, y0=GearPair().state({"d": 1.25}), t1=120.0),
-    Entry("clutch judder", "Disc of a clutch", Clutch, y0=Clutch().state({"theta": 0.1}), t1=120.0),
+    Entry("gear rattle", "Pair of gears with play", GearPair, y0=_at(d=1.25), t1=120.0),
+    Entry("clutch judder", "Disc of a clutch", Clutch, y0=_at(theta=0.1), t1=120.0),
     Entry(
         "buck converter",
         "DC-DC converter with a clocked comparator",

@@ -13,15 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._numerics._text import shown
+from .._numerics._text import positive, shown
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
 from ..orbits._orbit import Orbit
-from ..sweeps._sweep import CHUNK
+from ..sweeps._lanes import CHUNK
 from ..system._system import arrays_of, System
-from ._iterate import Iterate, PoincareMap, positive, Start
+from ._iterate import Iterate, PoincareMap, Start
 from ._section import Section, section_map
 from ._stroboscopic import Advance, phase_map
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._numerics._text import between, shown, written
+from .._numerics._text import between, positive, shown, written
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
@@ -19,7 +19,7 @@ from ..orbits._orbit import ravel
 from ..sweeps._sweep import sweep
 from ..system._parameter import parameter_path, put_parameter
 from ..system._system import arrays_of, System
-from ._iterate import Iterate, PoincareMap, positive
+from ._iterate import Iterate, PoincareMap
 from ._section import Section, section_map
 from ._stroboscopic import phase_map
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Int
 
 from .._numerics._autodiff import frozen
 from .._numerics._compile import interactive
-from .._numerics._text import between, listed, shown, written
+from .._numerics._text import between, listed, positive, shown, written
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
@@ -169,8 +169,3 @@ def iterated(
 def unless_failed(result: RESULTS, tree: Any) -> Any:
     """`tree`, or NaN, derivatives included."""
     return jax.tree.map(lambda x: x * jnp.where(is_okay(result), 1, jnp.nan).astype(x.dtype), tree)
-
-
-def positive(name: str, value: Any) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise ValueError(f"Argument `{name}` must be a positive integer, but got {value!r}.")

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._numerics._compile import interactive
-from .._numerics._text import listed, shown
+from .._numerics._text import listed, positive, shown
 from .._types import Scalar, Y
 from ..derivatives._saltation import saltation_matrices
 from ..derivatives._variational import arcs
@@ -25,7 +25,7 @@ from ..flow._solution import Solution
 from ..flow._solve import integrate
 from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, System
-from ._iterate import positive, Start
+from ._iterate import Start
 from ._stroboscopic import Advance, phase_map
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._numerics._autodiff import frozen
+from .._numerics._text import positive
 from .._types import Scalar, Y
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
@@ -24,7 +25,7 @@ from ..system._model import SwitchedSystem
 from ..system._sgn import sgn
 from ..system._switch import AbstractSwitch, forwarded
 from ..system._system import SwitchValues, System
-from ._iterate import Iterate, iterated, PoincareMap, positive
+from ._iterate import Iterate, iterated, PoincareMap
 
 
 PERIODS = 100  # of the forcing in which a solution is expected to return

@@ -7,13 +7,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._numerics._text import positive
 from .._types import Scalar, Y
 from ..flow._integrator import Integrator
 from ..flow._results import RESULTS
 from ..flow._solve import integrate
 from ..system._checks import check_system
 from ..system._system import System
-from ._iterate import Iterate, iterated, PoincareMap, positive
+from ._iterate import Iterate, iterated, PoincareMap
 
 
 class Advance(PoincareMap):

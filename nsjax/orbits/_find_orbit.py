@@ -1,5 +1,6 @@
 """The search for a periodic orbit, and for all that many starts lead to."""
 
+import os
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -17,7 +18,8 @@ from ..flow._arguments import check_numbers, checked_start
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, raise_if, RESULTS, SolveError
 from ..flow._solve import HINTS
-from ..sweeps._sweep import sweep
+from ..sweeps._devices import Devices
+from ..sweeps._long_sweep import sweep_in
 from ..system._checks import check_autonomous, check_clocks, check_direction
 from ..system._system import arrays_of, System
 from ._orbit import Orbit, ravel
@@ -185,7 +187,14 @@ def _check_period(system: System, t0: Scalar, y0: Y, period: Any, order: Any, co
 
 
 def find_orbits(
-    system: System, starts: StateT, *, period: Any = None, order: int = 1, **options: Any
+    system: System,
+    starts: StateT,
+    *,
+    period: Any = None,
+    order: int = 1,
+    devices: Devices | None = None,
+    path: str | os.PathLike | None = None,
+    **options: Any,
 ) -> list[Orbit[StateT]]:
     """The different periodic orbits that `find_orbit` finds from many starting points, unstable ones included.
 
@@ -196,6 +205,9 @@ def find_orbits(
     - `period`: autonomous systems: one guess of the period for all, or one each [time]; by default each start is
         followed to where it settles, which finds what attracts and little else.
     - `order`, `options`: as for `find_orbit`.
+    - `devices`: on which devices, see `sweep`.
+    - `path`: a folder that keeps what was found, 256 starts at a time, and from which a search that was interrupted
+        goes on; see `Sweep`.
 
     **Returns:** the orbits, those to which most starts led first; an empty list if there are none. Subharmonics that
     differ by periods of the forcing only are one orbit.
@@ -209,7 +221,7 @@ def find_orbits(
     def one(start: tuple[Y, Any]) -> Orbit:
         return find_orbit(system, start[0], period=start[1], order=order, throw=False, **options)
 
-    batch = sweep(one, (starts, guesses))
+    batch = sweep_in(path, one, (starts, guesses), devices=devices)
     arrays, static = eqx.partition(batch, eqx.is_array)
     good = np.flatnonzero(np.asarray(is_okay(batch.result)))
     return distinct_orbits([eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static) for i in good], order)

@@ -5,54 +5,28 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
+
+from .._numerics._compile import eager
+from .._numerics._text import known, positive
+from ._chunks import in_chunks
+from ._devices import DeviceQueue, Devices, devices_of
+from ._lanes import default_chunk, even_chunks, Lanes, lanes_of
+from ._piece import Piece
+from ._sharded import sharded, spread_over
 
 
-# Small enough for the working set of a step to stay in the cache and for lanes to wait for few others, large enough to
-# fill the vector units and hide what every step costs once: `benchmarks/growth.py` measures it.
-CHUNK = 256
+PIECES = 64  # of a sweep, from which on a piece is of several chunks: each costs a tenth of a millisecond of Python
+MOST = 16  # chunks in a piece
+
+_run = eqx.filter_jit(in_chunks)
 
 
-def _has_lanes(leaf: Any) -> bool:
-    return eqx.is_array(leaf) and leaf.ndim > 0
-
-
-def _number_of_lanes(mapped: Any) -> int:
-    lengths = {jax.tree_util.keystr(path): len(x) for path, x in jax.tree_util.tree_leaves_with_path(mapped)}
-    if not lengths:
-        raise ValueError(
-            "`nsjax.sweep` needs an array with an axis to go along among its arguments, but got only scalars."
-        )
-    if len(set(lengths.values())) > 1:
-        found = ", ".join(f"`args{path}` has {n}" for path, n in lengths.items())
-        raise ValueError(
-            f"Arguments of `nsjax.sweep` must have one length along their first axes, but {found}. "
-            "What is the same in every lane is left to the function: `lambda p: fn(p, same)`."
-        )
-    return next(iter(lengths.values()))
-
-
-@eqx.filter_jit
-def _run(fn: Callable[..., Any], mapped: Any, rest: Any, lanes: int, chunk: int) -> Any:
-    def lane(mapped: Any) -> Any:
-        return fn(*eqx.combine(mapped, rest))
-
-    if lanes <= chunk:
-        return jax.vmap(lane)(mapped)
-    # Chunks of one length are one program; a shorter last one would be compiled apart. So they are made as even as can
-    # be, and the last is filled up with its last lane.
-    chunks = -(-lanes // chunk)
-    chunk = -(-lanes // chunks)
-    place = jnp.minimum(jnp.arange(chunks * chunk), lanes - 1).reshape(chunks, chunk)
-    out = lax.map(jax.vmap(lane), jax.tree.map(lambda x: x[place], mapped))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:lanes], out)
-
-
-def sweep(fn: Callable[..., Any], *args: Any, chunk: int | None = None) -> Any:
+def sweep(fn: Callable[..., Any], *args: Any, chunk: int | None = None, devices: Devices | None = None) -> Any:
     """Applies `fn` to every lane: `jax.vmap(fn)(*args)`, but compiled, and in chunks, which on a CPU is faster for
-    thousands of lanes, and works in the memory of one chunk.
+    thousands of lanes, and works in the memory of one chunk; and on several devices, if there are.
 
     ```python
     def final(v_dr):
@@ -62,6 +36,7 @@ def sweep(fn: Callable[..., Any], *args: Any, chunk: int | None = None) -> Any:
     ```
 
     Derivatives go through it (`jax.jacfwd`, and `jax.grad` if `fn` allows it), and it may stand within `jax.jit`.
+    For sweeps that take hours there is `Sweep`, which keeps what it has done.
 
     **Arguments:**
 
@@ -69,18 +44,58 @@ def sweep(fn: Callable[..., Any], *args: Any, chunk: int | None = None) -> Any:
     - `args`: its arguments, any pytrees, such as a state or a `System`. Arrays of shape `(lanes, ...)` are mapped over
         their first axis; numbers and arrays of shape `()` are the same in every lane, and so is everything else.
         A parameter that is itself an array, the same in every lane, belongs into `fn`.
-    - `chunk`: how many lanes go together; by default 256 on a CPU, and all on other devices.
+    - `chunk`: how many lanes go together; by default 256 on a CPU, and on other devices all that a device has.
+    - `devices`: on which devices. By default on that on which JAX computes; and if the lanes of an argument are spread
+        over several devices (a `NamedSharding` along its first axis), on these, where each keeps its share.
+        A number of devices, or a list of them: pieces of the sweep are handed out to whichever is free, and the result
+        is where it would be without, bit for bit the same for any number of devices. (The cores of a CPU are devices
+        after `jax.config.update("jax_num_cpu_devices", n)`.) Derivatives are then to be taken within `fn`.
+        A `jax.sharding.Mesh`: the lanes are spread along all its axes, and so is the result if their number can be
+        divided evenly; within `jax.jit` and derivatives too, and over the processes of `jax.distributed`.
 
     **Returns:** what `fn` returned, with a first axis of length `lanes`.
 
-    **Raises:** `ValueError` if the arrays are of different lengths along their first axes, or if there are none.
+    **Raises:** `ValueError` if the arrays are of different lengths along their first axes, or if there are none; for
+    `devices` that there are not, and for a number or a list of devices within `jax.jit`, `jax.vmap` and derivatives.
     """
-    if chunk is not None and (not isinstance(chunk, int) or chunk < 1):
-        raise ValueError(f"Argument `chunk` must be a positive integer, but got {chunk!r}.")
-    # Numbers are traced too: a new one is no new program.
-    args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, (float, np.ndarray)) else x, args)
-    mapped, rest = eqx.partition(args, _has_lanes)
-    lanes = _number_of_lanes(mapped)
+    if chunk is not None:
+        positive("chunk", chunk)
+    lanes = lanes_of(args)
+    if isinstance(devices, Mesh):
+        return sharded(fn, lanes, chunk, devices, devices.axis_names)
+    if devices is not None:
+        return _handed_out(fn, lanes, chunk, devices)
+    spread = spread_over(lanes.mapped)
+    if spread is not None:
+        return sharded(fn, lanes, chunk, *spread)
     if chunk is None:
-        chunk = CHUNK if jax.default_backend() == "cpu" else lanes
-    return _run(fn, mapped, rest, lanes, chunk)
+        chunk = default_chunk(lanes.number, jax.default_backend())
+    return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, chunk)
+
+
+def _handed_out(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices: Any) -> Any:
+    if not (eager() and known((fn, lanes))):
+        raise ValueError(
+            "Argument `devices` of `nsjax.sweep` must be a `jax.sharding.Mesh` within `jax.jit`, `jax.vmap` and "
+            f'derivatives, but is {devices!r}. Write `devices=jax.make_mesh((n,), ("lanes",))`, or let what is swept '
+            "return the derivative: `nsjax.sweep(jax.jacfwd(fn), x, devices=n)`."
+        )
+    found = devices_of(devices)
+    if chunk is None:
+        chunk = default_chunk(-(-lanes.number // len(found)), found[0].platform)
+    chunks, chunk = even_chunks(lanes.number, chunk)
+    if not lanes.number:
+        return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, 1)
+    together = min(MOST, -(-chunks // PIECES))
+    found = found[: -(-chunks // together)]  # a device without a piece needs no program
+    piece, lanes = Piece(fn, lanes, chunk, together, found), lanes.on_host()
+    out = [np.empty((lanes.number, *form.shape), form.dtype) for form in piece.program.forms]
+    starts = range(0, lanes.number, piece.size)
+    with DeviceQueue(found) as each:
+        futures = [
+            each.submit(lambda device, i=i: piece.run(lanes.rows(slice(i, i + piece.size)), device)) for i in starts
+        ]
+        for start, future in zip(starts, futures):
+            for whole, part in zip(out, future.result()):
+                whole[start : start + len(part)] = part
+    return jax.tree.unflatten(piece.program.tree, [jnp.asarray(x) for x in out])

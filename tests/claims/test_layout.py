@@ -73,6 +73,8 @@ def test_importing_is_light_and_changes_nothing():
         "import nsjax.__main__\n"
         "assert dict(jax.config.values) == before\n"
         "assert 'matplotlib' not in sys.modules\n"
+        "jax.config.update('jax_num_cpu_devices', 2)\n"  # refused once JAX has begun to compute
+        "assert len(jax.devices('cpu')) == 2\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=PACKAGE.parent, capture_output=True, text=True)
     assert not done.returncode, done.stderr

@@ -150,6 +150,10 @@ CASES = {
     "a sensitivity": (sensitivity(True), 5, "sensitivity\n", "derivative  x = 0.3, v[0] = 1, v[1] = 1, v[2] = 1"),
     "none at a grazing": (sensitivity(False), 5, "sensitivity that is not defined\n", "belt -1 -> belt +0"),
     "sensitivities": (several(sensitivity(True), sensitivity(False)), 5, "2 sensitivities, 1 of them defined", "x = 0.3,"),
+    "how far a sweep is": (
+        nsjax.sweeps.Status(1000, 450, 10, 4, 1, 50.0, 11.0),
+        1, "450 of 1,000 lanes (45.0 %), 4 of 10 blocks, 1 running", "50 lanes/s, 11 s left",
+    ),
     "a table": (TABLE, 3, "| method | tolerance |", "| Tsit5 | 1e-06 | 1.0e-07 | 0.1 | 2.0 |"),
 }  # fmt: skip
 
@@ -184,7 +188,8 @@ def test_without_numbers(name):
 
 
 def test_all_public_results_are_in_the_table():
-    """`Solution` is in `test_mistakes`, continuations are in `test_orbit_growth` and `test_equilibrium_growth`."""
+    """`Solution` is in `test_mistakes`, continuations are in `test_orbit_growth` and `test_equilibrium_growth`, `Sweep` is
+    in `test_long_sweep`."""
     others = {
         "Method",
         "Segment",
@@ -192,6 +197,7 @@ def test_all_public_results_are_in_the_table():
         "EquilibriumContinuation",
         "OrbitContinuation",
         "System",
+        "Sweep",
         "Affine",
         "Exponential",
         "Taylor",

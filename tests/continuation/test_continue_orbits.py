@@ -63,6 +63,19 @@ def duffing():
 
 
 @pytest.mark.slow
+def test_kept_in_a_folder(walls, tmp_path):
+    """Two lanes a block, and both ways of each; the second call computes nothing."""
+    orbits, want = walls
+    calls = [
+        continue_orbits(orbits, "omega", (0.1, 1.5), chunk=2, path=tmp_path, devices=devices) for devices in (None, 1)
+    ]
+    assert len(list((tmp_path / "blocks").iterdir())) == len(GAPS)
+    for found in calls:
+        np.testing.assert_allclose(found.values, want.values, rtol=1e-12)
+        assert np.array_equal(found.kinds, want.kinds) and np.array_equal(found.ends, want.ends)
+
+
+@pytest.mark.slow
 def test_grazing(walls):
     _, branches = walls
     assert list(branches.ends[2]) == ["no orbit"] * 2 and branches.num[2] == 0

@@ -16,7 +16,7 @@ from models import Motion, pid
 
 import nsjax
 from nsjax import find_orbit, gallery, OrbitBranch, OrbitContinuation
-from nsjax.continuation._progress import ProgressLine
+from nsjax._numerics._progress import ProgressLine
 
 
 METHOD = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-12), max_steps=8192)

@@ -80,6 +80,23 @@ def test_section_6_6():
     np.testing.assert_allclose(again.multipliers, unstable.multipliers, atol=1e-8)
 
 
+@pytest.mark.slow
+def test_kept_in_a_folder(tmp_path):
+    """A second call searches for nothing, on whatever devices; another search is refused."""
+    angle = jnp.arange(6.0)
+    starts = Motion(1.95 * jnp.cos(angle), 1.95 * jnp.sin(angle))
+    (orbit,) = find_orbits(Rings(), starts, period=6.2, path=tmp_path, **METHOD)
+    np.testing.assert_allclose(np.hypot(*orbit.y0), 2, atol=1e-9)
+    (block,) = (tmp_path / "blocks").iterdir()
+    before = block.stat().st_mtime_ns
+    (again,) = find_orbits(Rings(), starts, period=6.2, path=tmp_path, devices=1, **METHOD)
+    assert block.stat().st_mtime_ns == before
+    np.testing.assert_array_equal([*again.y0], [*orbit.y0])
+    np.testing.assert_allclose(again.solve().y1, orbit.y0, atol=1e-9)
+    with pytest.raises(ValueError, match="holds another sweep"):
+        find_orbits(Rings(), starts, period=6.3, path=tmp_path, **METHOD)
+
+
 @pytest.mark.parametrize("name, value", [("throw", True), ("segments", [])])
 def test_wrong_arguments(name, value):
     with pytest.raises(ValueError, match=f"Argument `{name}` is not for `find_orbits`"):

@@ -77,6 +77,32 @@ def test_derivatives_and_jit():
         np.testing.assert_allclose(found[1], want[1], rtol=1e-12)
 
 
+def test_gradients_of_many_lanes_in_little_memory():
+    """Of a loss over all lanes: forward, and in reverse with each lane computed once more, memory is that of a chunk and of
+    what goes in and out; in reverse alone it is that of all that all lanes did."""
+
+    def lane(x, k):
+        return jax.lax.scan(lambda y, _: (jnp.sin(k * y) + x, None), x, length=100)[0]
+
+    def loss(fn):
+        return lambda k, x: jnp.mean(sweep(lambda x: fn(x, k), x) ** 2)
+
+    again = jax.grad(loss(jax.checkpoint(lane)))
+    ways = dict(forward=jax.jacfwd(loss(lane)), reverse=jax.grad(loss(lane)), again=again)
+    sizes, values = {}, {}
+    for name, way in ways.items():
+        for lanes in (1024, 16384):
+            args = jnp.asarray(0.7), jnp.linspace(0.1, 1.0, lanes)
+            program = jax.jit(way).lower(*args).compile()
+            sizes[name, lanes] = program.memory_analysis().temp_size_in_bytes
+            values[name, lanes] = program(*args)
+    most = 15360 * 8 * 10  # bytes: some numbers a lane
+    for name in ("forward", "again"):
+        assert sizes[name, 16384] - sizes[name, 1024] < most < 0.2 * sizes["reverse", 16384]
+        for lanes in (1024, 16384):
+            np.testing.assert_allclose(values[name, lanes], values["reverse", lanes], rtol=1e-12)
+
+
 def test_a_new_number_is_no_new_program():
     traced = []
 

@@ -1,6 +1,7 @@
 """Many branches of periodic orbits at once: a fixed number of points each, in one compiled call."""
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -22,6 +23,8 @@ from ....orbits._orbit import Orbit
 from ....orbits.segments._equations import OrbitCurve
 from ....orbits.segments._guard_minima import extremes
 from ....orbits.segments._itinerary import capacity_for, OrbitItinerary, Start, starts_of
+from ....sweeps._devices import Devices
+from ....sweeps._long_sweep import sweep_in
 from ....sweeps._sweep import sweep
 from ....system._parameter import get_parameter, parameter_path, put_parameter
 from ....system._system import arrays_of, System
@@ -107,6 +110,8 @@ def continue_orbits(
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     max_steps: int = 4096,
     chunk: int | None = None,
+    devices: Devices | None = None,
+    path: str | os.PathLike | None = None,
 ) -> OrbitBranches:
     """Follows many periodic orbits at once while a parameter varies, each both ways to its first corner.
 
@@ -133,7 +138,9 @@ def continue_orbits(
     - `points`: the largest number of points each way.
     - `scale`: the typical size of each component of the state; by default what it has along the first orbit.
     - `max_step`, `solver`, `stepsize_controller`, `max_steps`: as for `continue_orbit`.
-    - `chunk`: how many lanes go together, see `sweep`.
+    - `chunk`, `devices`: how many lanes go together, and on which devices, see `sweep`.
+    - `path`: a folder that keeps the branches, a chunk of lanes at a time, and from which a call that was interrupted
+        goes on; see `Sweep`.
 
     **Returns:** `OrbitBranches`. Lanes without an orbit to start from, or outside the interval, have no points.
 
@@ -143,8 +150,8 @@ def continue_orbits(
     each = list(orbits) if isinstance(orbits, Sequence) else _unstacked(orbits)
     for one in each:
         check_precision(jnp.result_type(one.t0), "find `orbit`")
-    path, (low, high) = parameter_path(each[0].system, parameter), interval
-    values = [float(get_parameter(one.system, path)) for one in each]
+    own, (low, high) = parameter_path(each[0].system, parameter), interval
+    values = [float(get_parameter(one.system, own)) for one in each]
     good = [bool(is_okay(one.result) & one.admissible) and low <= v <= high for one, v in zip(each, values)]
     if not any(good):
         raise ValueError("Argument `orbits` must hold an orbit that was found, within `interval`, but none is.")
@@ -160,7 +167,7 @@ def continue_orbits(
     twice = jax.tree.map(lambda x: np.concatenate([x, x]), (lanes, np.array(good)))
     upwards = np.repeat([1.0, -1.0], len(each))
     follow = _Follow(curve, jnp.asarray(max_step), points)
-    found = on_host(sweep(follow, *twice, upwards, chunk=chunk))
+    found = on_host(sweep_in(path, follow, *twice, upwards, chunk=chunk, devices=devices))
     return _gathered(curve, parameter, lanes, found)
 
 

@@ -1,0 +1,155 @@
+"""A piece of a sweep: some chunks of lanes, by one program that is compiled once for each device."""
+
+import collections
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+
+from .._numerics._compile import without_collection
+from ._devices import Device
+from ._lanes import Lanes
+
+
+try:
+    from jax._src.config import trace_context
+except ImportError:  # then of all settings that a program depends on only the one that matters most is looked at
+    trace_context = None
+
+KEPT = 16  # programs
+
+
+class Piece:
+    """Up to `chunks` chunks of `chunk` lanes, as many as there are.
+
+    The program does not know how many lanes there are in all, nor who computes the others. So a lane has the same bits
+    whichever device, thread or process it falls to, and whatever was done before.
+    """
+
+    def __init__(self, fn: Callable[..., Any], lanes: Lanes, chunk: int, chunks: int, devices: Sequence[Device]):
+        self.chunk, self.size, self.platform = chunk, chunk * chunks, devices[0].platform
+        # What is the same for all pieces is brought to each device once.
+        self._shared, static = eqx.partition((fn, lanes.rest), eqx.is_array)
+        self._there: dict[Device, Any] = {}
+        self.program = _program_for(static, self._shared, lanes.mapped, chunk, chunks, tuple(devices))
+
+    def run(self, mapped: Any, device: Device) -> list[np.ndarray]:
+        """The leaves of what `fn` returns, for up to `size` lanes. Each device has a thread that calls it."""
+        number = len(jax.tree.leaves(mapped)[0])
+        compiled = self.program.on(device)
+        if device not in self._there:
+            self._there[device] = jax.device_put(self._shared, device)
+        full = jax.tree.map(lambda x: jax.device_put(_filled(x, self.size), device), mapped)
+        count = jax.device_put(np.int32(-(-number // self.chunk)), device)
+        return [np.asarray(x)[:number] for x in jax.tree.leaves(compiled(self._there[device], full, count))]
+
+
+def _filled(x: Any, size: int) -> Any:
+    """With its last row again and again: what is computed there is what was computed already."""
+    short = size - len(x)
+    if not short:
+        return x
+    join = jnp.concatenate if isinstance(x, jax.Array) else np.concatenate
+    return join([x, *[x[-1:]] * short])
+
+
+class Program:
+    """What is compiled.
+
+    **Attributes:**
+
+    - `text`, `consts`: it, and the arrays that it holds.
+    - `tree`, `forms`: the structure of what `fn` returns, and the shapes and dtypes of its leaves for one lane.
+    """
+
+    def __init__(self, function: Callable[..., Any], forms: Any, devices: Sequence[Device]):
+        def placed(device: Device) -> Any:
+            place = jax.sharding.SingleDeviceSharding(device)
+            kind = jax.ShapeDtypeStruct
+            return jax.tree.map(lambda x: kind(x.shape, x.dtype, sharding=place, weak_type=x.weak_type), forms)
+
+        jitted = jax.jit(function)
+        with without_collection():
+            # Lowered here and not in the threads, which do not see settings that are made by `with jax.enable_x64():`.
+            traced = [jitted.trace(*placed(device)) for device in devices]
+            lowered = [one.lower() for one in traced]
+        self.consts, self._first = traced[0].jaxpr.consts, lowered[0]
+        out, self.tree = jax.tree.flatten(lowered[0].out_info)
+        self.forms = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in out]
+        if any(jnp.issubdtype(form.dtype, jax.dtypes.extended) for form in self.forms):
+            raise TypeError("What `fn` returns must be numbers: of a random key return `jax.random.key_data(key)`.")
+        self._lowered = dict(zip(devices, lowered))
+        self._compiled: dict[Device, Any] = {}
+        self._locks = {device: threading.Lock() for device in devices}
+
+    @property
+    def text(self) -> str:
+        return self._first.as_text()
+
+    def on(self, device: Device) -> Any:
+        """Compiled for a device, on the first call."""
+        with self._locks[device]:
+            if device not in self._compiled:
+                self._compiled[device] = self._lowered.pop(device).compile()
+            return self._compiled[device]
+
+
+_kept: collections.OrderedDict[Any, Program] = collections.OrderedDict()
+
+
+def _program_for(
+    static: Any, shared: Any, mapped: Any, chunk: int, chunks: int, devices: tuple[Device, ...]
+) -> Program:
+    """The one of an earlier call, where all is the same, as `jax.jit` would have it."""
+
+    def form(x: Any) -> jax.ShapeDtypeStruct:
+        aval = jax.typeof(x)
+        return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type)
+
+    def rows(x: Any) -> jax.ShapeDtypeStruct:
+        one = form(x[:0])
+        return jax.ShapeDtypeStruct((chunk * chunks, *one.shape[1:]), one.dtype, weak_type=one.weak_type)
+
+    forms = jax.tree.map(form, shared), jax.tree.map(rows, mapped), form(np.int32(0))
+    (own, own_tree), (flat, tree) = jax.tree.flatten(static), jax.tree.flatten(forms)
+    types = tuple((x.shape, x.dtype, x.weak_type) for x in flat)
+    # (Of a number with its type: True is 1, and another program.)
+    settings = trace_context() if trace_context is not None else jnp.result_type(float)
+    key = tuple((type(x), x) for x in own), own_tree, types, tree, chunk, chunks, devices, settings
+    try:
+        found = _kept.pop(key, None)
+    except TypeError:  # the function holds what cannot be compared
+        return Program(_function(static, chunk, chunks), forms, devices)
+    program = found or Program(_function(static, chunk, chunks), forms, devices)
+    _kept[key] = program
+    while len(_kept) > KEPT:
+        _kept.popitem(last=False)
+    return program
+
+
+def _function(static: Any, chunk: int, chunks: int) -> Callable[..., Any]:
+    def piece(shared: Any, mapped: Any, count: Any) -> Any:
+        fn, rest = eqx.combine(shared, static)
+        # (As a program of its own it is traced once, though it is asked for its shapes first.)
+        lanes = jax.jit(jax.vmap(lambda mapped: fn(*eqx.combine(mapped, rest))))
+        if chunks == 1:
+            return lanes(mapped)
+
+        def taken(i: Any) -> Any:
+            return jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, i * chunk, chunk), mapped)
+
+        def further(i: Any, out: Any) -> Any:
+            return jax.tree.map(
+                lambda all, some: lax.dynamic_update_slice_in_dim(all, some, i * chunk, 0), out, lanes(taken(i))
+            )
+
+        form = jax.eval_shape(lambda: lanes(taken(0)))
+        out = jax.tree.map(lambda x: jnp.zeros((chunk * chunks, *x.shape[1:]), x.dtype), form)
+        return lax.fori_loop(0, count, further, out)
+
+    return piece
