@@ -19,14 +19,13 @@ from ._fingerprint import differences, fingerprint
 from ._folder import Folder
 from ._lanes import CHUNK, default_chunk, lanes_of
 from ._outcomes import Outcome, outcome_of
-from ._piece import Piece
+from ._piece import MOST, Piece
 from ._progress import Meter, Progress, Status
 from ._sweep import sweep
 from ._work import Work
 
 
 BLOCK = 65536
-MOST = 16  # chunks in a piece: so many that handing it out costs little, so few that no device waits long for another
 
 
 class Block(NamedTuple):

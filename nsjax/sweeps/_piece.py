@@ -22,6 +22,7 @@ except ImportError:  # then of all settings that a program depends on only the o
     trace_context = None
 
 KEPT = 16  # programs
+MOST = 16  # chunks: so many that handing a piece out costs little, so few that no device waits long for another
 
 
 class Piece:

@@ -14,12 +14,11 @@ from .._numerics._text import known, positive
 from ._chunks import in_chunks
 from ._devices import DeviceQueue, Devices, devices_of
 from ._lanes import default_chunk, even_chunks, Lanes, lanes_of
-from ._piece import Piece
+from ._piece import MOST, Piece
 from ._sharded import sharded, spread_over
 
 
 PIECES = 64  # of a sweep, from which on a piece is of several chunks: each costs a tenth of a millisecond of Python
-MOST = 16  # chunks in a piece
 
 _run = eqx.filter_jit(in_chunks)
 
