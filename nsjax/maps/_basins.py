@@ -192,17 +192,18 @@ class _Search:
         self.known.append(around[-order:])
         return len(self.known) - 1
 
-    def add(self, x: np.ndarray, name: str) -> None:
-        """Those that starts lead to, which are said to lie on attractors."""
-        for row in x:
-            before, self.finds = self.finds, True
-            label = self.follow(row[None])[0][0]
-            self.finds = before
+    def add(self, x: np.ndarray) -> None:
+        """The attractors to which states lead, in this order."""
+        finding = dataclasses.replace(self, finds=True)  # of the same list
+        for k, row in enumerate(x):
+            label = finding.follow(row[None])[0][0]
             if label < 0:
                 raise ValueError(
-                    f"Argument `attractors`: from ({', '.join(f'{v:.6g}' for v in row)}) {name} does not settle within "
-                    f"{self.most} iterates, so that it is not attracted by a periodic orbit."
+                    f"Argument `attractors`: the solution from attractor {k}, ({', '.join(f'{v:.6g}' for v in row)}), "
+                    f"does not settle on a periodic orbit within {self.most} iterates."
                 )
+            if label < k:
+                raise ValueError(f"Argument `attractors`: attractors {label} and {k} are the same within `tol`.")
 
 
 def _padded(x: Any, size: int) -> Any:
@@ -252,8 +253,8 @@ def basins(
     - `attractors`: `Orbit`s, or states on or near attractors; by default those that the starts settle on.
     - `tol`: how near is near, in each component of the state. Attractors nearer to each other than this are one.
     - `max_iterates`: after how many periods (or crossings) to give up; eight are made at a time.
-    - `refine`: of a grid with two axes: how many times it is made twice as fine where neighbours differ. Points between
-        equal neighbours are filled in.
+    - `refine`: of a grid with two axes: how many times it is made twice as fine where neighbours differ. Points whose
+        neighbours are all alike are filled in.
     - `section`, `direction`, `max_time`: as for `poincare_map`, for an autonomous system with periodic orbits; a forced
         one is looked at once in each period, at the phase of `t0` [time].
     - `interval`: instead of these, for an autonomous system whose solutions come to rest: how often to look [time].
@@ -278,8 +279,8 @@ def basins(
     lanes = _Lanes(step, system, t0, like, min(8, max_iterates))
     search = _Search(lanes, float(tol), max_iterates, FEW if np.prod(shape) <= FEW else CHUNK, attractors is None)
     if attractors is not None:
-        given = [a.y0 if isinstance(a, Orbit) else a for a in attractors]
-        search.add(np.stack([np.asarray(jfu.ravel_pytree(y)[0], t0.dtype) for y in given]), "the solution")
+        given = [_state_of(k, a, system, t0) for k, a in enumerate(attractors)]
+        search.add(np.stack([np.asarray(jfu.ravel_pytree(y)[0], t0.dtype) for y in given]))
     x = np.stack([np.asarray(leaf, t0.dtype) for leaf in jax.tree.leaves(starts)], axis=-1)
     found = [a.reshape(shape) for a in search.follow(x.reshape(-1, x.shape[-1]))]
     for _ in range(refine):
@@ -293,27 +294,47 @@ def basins(
     return Basins(labels, tuple(map(states, search.known)), counts, states(x), results)
 
 
+def _state_of(k: int, attractor: Orbit | Y, system: System, t0: Scalar) -> Y:
+    """A state on it, at the phase of `t0`."""
+    if not isinstance(attractor, Orbit):
+        return attractor
+    if not attractor.stable:
+        raise ValueError(f"Argument `attractors`: attractor {k} is an orbit that is not stable.")
+    if system.period is not None:
+        turns = float((attractor.t0 - t0) / system.period)
+        if abs(turns - round(turns)) > 1e-9:
+            raise ValueError(
+                f"Argument `attractors`: orbit {k} begins at t = {float(attractor.t0):.6g}, another phase of the "
+                f"forcing than `t0` = {float(t0):.6g}."
+            )
+    return attractor.y0
+
+
 def _finer(search: _Search, x: np.ndarray, *found: np.ndarray) -> tuple[np.ndarray, ...]:
-    """A grid twice as fine: new points between equal neighbours are as these, the others are followed."""
+    """A grid twice as fine. Points beside one with another label are followed, those that were filled in before too,
+    until there are none left: so a basin that is thinner than the grid is followed along its length."""
     rows, columns = (2 * n - 1 for n in x.shape[:2])
     fine = np.zeros((rows, columns, x.shape[2]), x.dtype)
     fine[::2, ::2] = x
     fine[1::2, ::2] = (x[:-1] + x[1:]) / 2
     fine[:, 1::2] = (fine[:, :-1:2] + fine[:, 2::2]) / 2
-    new = [np.zeros((rows, columns), a.dtype) for a in found]
+    # Filled in as one of the neighbours; nothing but 0 is known of the iterates and the result there.
+    label = np.repeat(np.repeat(found[0], 2, axis=0), 2, axis=1)[:rows, :columns]
+    new = [label, *(np.zeros((rows, columns), a.dtype) for a in found[1:])]
     for a, old in zip(new, found):
         a[::2, ::2] = old
-    old, labels = found[0], new[0]
-    same = np.ones((rows, columns), bool)
-    along, across = old[:-1] == old[1:], old[:, :-1] == old[:, 1:]
-    same[1::2, ::2], same[::2, 1::2] = along, across
-    same[1::2, 1::2] = along[:, :-1] & along[:, 1:] & across[:-1]
-    labels[1::2, ::2], labels[::2, 1::2], labels[1::2, 1::2] = old[:-1], old[:, :-1], old[:-1, :-1]
-    ask = ~same
-    if ask.any():
+    while (ask := (new[1] == 0) & _beside_another(label)).any():
         for a, value in zip(new, search.follow(fine[ask])):
             a[ask] = value
     return fine, *new
+
+
+def _beside_another(label: np.ndarray) -> np.ndarray:
+    """Which points have one of another label among their eight neighbours."""
+    rows, columns = label.shape
+    around = np.pad(label, 1, mode="edge")
+    shifted = (around[i : i + rows, j : j + columns] for i in range(3) for j in range(3))
+    return np.any([part != label for part in shifted], axis=0)
 
 
 def _step(

@@ -1,11 +1,13 @@
 """Basins of attraction against what is known of them, and against an independent simulation."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from exponents import after, ImpactOscillator
+from models import PeriodicHammer
 
 import nsjax
 from nsjax.gallery import Motion
@@ -45,27 +47,9 @@ class Flip(nsjax.System):
         return Pair(-jnp.tanh(2 * y.x), y.z - 1)
 
 
-class Stopped(nsjax.System):
-    """The forced oscillator with a wall at x = 0: here two orbits attract."""
-
-    c: float = 0.1
-    e: float = 0.8
-    omega: float = 2.6
-
-    @property
-    def period(self):
-        return 2 * jnp.pi / self.omega
-
-    def vector_field(self, t, y, s):
-        return Motion(y.v, -y.x - self.c * y.v + jnp.cos(self.omega * t) - s.wall)
-
-    @nsjax.impact
-    def wall(self, t, y):
-        return -y.x
-
-    @wall.restitution
-    def wall(self):
-        return self.e
+STOPPED = PeriodicHammer(
+    c=0.1, x_w=0.0, f_0=-1.0, omega=2.6
+)  # two orbits attract; the mirror image of `ImpactOscillator`
 
 
 def grid(nx, ny):
@@ -109,11 +93,30 @@ def test_an_orbit_of_two_laps():
     assert (found.labels == 0).all()
 
 
+def test_orbits_as_attractors():
+    """They must be what they are said to be."""
+
+    def orbit(**changes):
+        nothing = dict.fromkeys(f.name for f in dataclasses.fields(nsjax.Orbit))
+        return nsjax.Orbit(**nothing | dict(t0=jnp.zeros(()), y0=Motion(0.65, -0.07), stable=jnp.array(True)) | changes)
+
+    starts = Motion(np.array([0.5, 0.7]), np.zeros(2))
+    for given, words in (
+        ([orbit(stable=jnp.array(False))], "attractor 0 is an orbit that is not stable"),
+        ([orbit(t0=jnp.ones(()))], "begins at t = 1, another phase"),
+        ([orbit(), orbit()], "attractors 0 and 1 are the same"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            nsjax.basins(STOPPED, starts, given)
+    found = nsjax.basins(STOPPED, starts, [orbit()])
+    assert len(found.attractors) == 1 and (found.labels == 0).any()
+
+
 def test_mistakes():
     y = grid(3, 3)
     for system, starts, options, words in (
         (Switch(), y, {}, "autonomous: give a `section`"),
-        (Stopped(), Motion(*y), dict(interval=1.0), "`interval` is for autonomous"),
+        (STOPPED, Motion(*y), dict(interval=1.0), "`interval` is for autonomous"),
         (Switch(), Pair(1.0, 0.0), dict(interval=1.0), "leaves of one shape"),
         (Switch(), Pair(y.x, y.z[0]), dict(interval=1.0), "leaves of one shape"),
         (Switch(), Pair(y.x[0], y.z[0]), dict(interval=1.0, refine=1), "grids with two axes"),
@@ -127,12 +130,12 @@ def test_mistakes():
 def test_an_impact_oscillator():
     """Orbits of one and of three periods, against solutions in closed form between impacts, which are followed for 400
     periods: no start is on another side, and all but those at the boundary are decided."""
-    x, v = np.meshgrid(np.linspace(-1.5, -0.05, 24), np.linspace(-1, 1, 21))
-    found = nsjax.basins(Stopped(), Motion(x, v), refine=1, tol=1e-4)
+    x, v = np.meshgrid(np.linspace(0.05, 1.5, 24), np.linspace(-1, 1, 21))
+    found = nsjax.basins(STOPPED, Motion(x, v), refine=1, tol=1e-4)
     orders = [len(points.x) for points in found.attractors]
     assert sorted(orders) == [1, 3] and (found.result == 0).all()
     x, v = found.starts.x.ravel(), found.starts.v.ravel()
-    ends = np.stack(after(ImpactOscillator(1.0, 2.6, 0.1, 0.8), x, v, 400, steps=32), axis=-1)
+    ends = -np.stack(after(ImpactOscillator(1.0, 2.6, 0.1, 0.8), -x, -v, 400, steps=32), axis=-1)
     known = np.isfinite(ends).all(axis=1)  # those that never come to rest
     assert known.mean() > 0.9
     far = [np.abs(ends[:, None] - np.stack(points, axis=-1)).max(axis=2).min(axis=1) for points in found.attractors]

@@ -95,6 +95,14 @@ class Hammer(nsjax.System):
         return self.e
 
 
+class PeriodicHammer(Hammer):
+    """The same, which says its period."""
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
 class Pair(nsjax.System):
     """(x, y)' = (w t, g) - [[2, c], [c, 2]] (sgn x, sgn y): two surfaces, coupled by c; piecewise polynomial in t."""
 
