@@ -1,4 +1,4 @@
-"""The picture at the top of the README: `python docs/pictures/front.py` (six minutes on one core).
+"""The picture at the top of the README: `python docs/pictures/front.py` (seven minutes on one busy core).
 
     --keep FOLDER    where the branches and the chart are kept, and taken from the next time
 
