@@ -104,6 +104,10 @@ def test_there_are_blocks():
     assert sum(block.output is not None for block in found) >= 20
     written = sum(path.read_text(encoding="utf-8").count("```python") for path in DOCUMENTS.values())
     assert len(found) == written
+    # What a newcomer reads first runs, all of it.
+    first = [path for name, path in DOCUMENTS.items() if name == "README.md" or name.startswith("docs/guide/")]
+    assert len(first) > 10
+    assert not any(block.excerpt for path in first for block in blocks(path))
 
 
 @pytest.fixture
@@ -114,7 +118,7 @@ def as_a_user(tmp_path, monkeypatch):
         yield
 
 
-QUICK = [name for name, path in DOCUMENTS.items() if any(not block.slow for block in blocks(path))]
+QUICK = [name for name, path in DOCUMENTS.items() if any(not b.slow and not b.excerpt for b in blocks(path))]
 SLOW = [name for name, path in DOCUMENTS.items() if any(block.slow for block in blocks(path))]
 
 

@@ -15,8 +15,11 @@ DOCUMENTS = {
     for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 }
 # A block of Python, and one without a language right after it: its output. `<!-- slow -->` stands before one that
-# compiles for more than a few seconds; it and what needs it are run by the slow tests.
-BLOCK = re.compile(r"(?:<!-- (slow) -->\n+)?^```python\n(.*?)^```$(?:\n\n^```\n(.*?)^```$)?", re.DOTALL | re.MULTILINE)
+# compiles for more than a few seconds; it and what needs it are run by the slow tests. `<!-- not run: why -->` is for what
+# cannot run in a test (millions of lanes, several machines); it is still Python.
+BLOCK = re.compile(
+    r"(?:<!-- (slow|not run: [^>]+) -->\n+)?^```python\n(.*?)^```$(?:\n\n^```\n(.*?)^```$)?", re.DOTALL | re.MULTILINE
+)
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|inf|nan)j?")
 
 
@@ -24,12 +27,17 @@ class Block(NamedTuple):
     code: str
     output: str | None
     slow: bool
+    excerpt: bool
     line: int
 
 
 def blocks(path: pathlib.Path) -> list[Block]:
     text = path.read_text(encoding="utf-8")
-    return [Block(b[2], b[3], b[1] is not None, text[: b.start(2)].count("\n")) for b in BLOCK.finditer(text)]
+    found = BLOCK.finditer(text)
+    return [
+        Block(b[2], b[3], b[1] == "slow", (b[1] or "").startswith("not run"), text[: b.start(2)].count("\n"))
+        for b in found
+    ]
 
 
 def run(path: pathlib.Path, slow: bool) -> int:
@@ -41,8 +49,10 @@ def run(path: pathlib.Path, slow: bool) -> int:
     for block in blocks(path):
         if block.slow and not slow:
             continue
-        printed, count = io.StringIO(), count + 1
         code = compile("\n" * block.line + block.code, str(path), "exec")
+        if block.excerpt:
+            continue
+        printed, count = io.StringIO(), count + 1
         with contextlib.redirect_stdout(printed):
             exec(code, namespace)
         if block.output is not None:
