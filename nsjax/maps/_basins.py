@@ -32,8 +32,7 @@ SURE = 0.05  # of `tol`: so far at most from where it tends to is what counts as
 
 
 @shown
-@dataclasses.dataclass(frozen=True)
-class Basins:
+class Basins(eqx.Module):
     """Which attractor each start leads to.
 
     **Attributes:**

@@ -2,7 +2,6 @@
 
 import pathlib
 import re
-import textwrap
 from typing import NamedTuple
 
 import jax
@@ -15,7 +14,9 @@ from models import Heat, Motion, Thermostat
 import nsjax
 
 
-README = (pathlib.Path(__file__).parents[2] / "README.md").read_text()
+ROOT = pathlib.Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text()
+MODELLING = (ROOT / "docs" / "guide" / "modelling.md").read_text()
 
 
 class Line(NamedTuple):
@@ -29,17 +30,16 @@ class Driven(nsjax.System):
         return Line(-y.x + jnp.cos(self.omega * t))
 
 
-def test_a_forced_model_says_its_period_as_in_the_readme():
-    """Without it the error says what to write; with the lines of the README the orbit is found, in closed form
+def test_a_forced_model_says_its_period_as_in_the_guide():
+    """Without it the error says what to write; with the lines of the guide the orbit is found, in closed form
     x(0) = 1/(1 + ω²)."""
     with pytest.raises(ValueError, match=r"has no `period`.*return 2 \* jnp.pi / self.omega"):
         nsjax.find_orbit(Driven(), Line(0.0), period=3.0)
-    (block,) = [text for text in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if "def period(self)" in text]
-    namespace = {"jnp": jnp}
-    exec(textwrap.dedent(block), namespace)
-    forced = type("Forced", (Driven,), {"period": namespace["period"]})
-    orbit = nsjax.find_orbit(forced(), Line(0.0))
-    np.testing.assert_allclose(orbit.y0.x, 1 / 5, atol=1e-12)
+    (block,) = [text for text in re.findall(r"```python\n(.*?)```", MODELLING, re.DOTALL) if "def period(self)" in text]
+    namespace = {"jnp": jnp, "nsjax": nsjax, "Heat": Heat}
+    exec(block, namespace)
+    orbit = nsjax.find_orbit(namespace["Driven"](), Heat(0.0))
+    np.testing.assert_allclose(orbit.y0.T, 1 / 5, atol=1e-12)
     assert "period" in nsjax.System.__doc__
 
 

@@ -250,10 +250,9 @@ def slip(tau, c, x, v):
 
 @pytest.mark.slow
 def test_infinitely_unstable_folds():
-    """Section 6.7, as README has it: the mass comes back to the belt just as this could hold it with the slip force."""
-    blocks = re.findall(
-        r"```python\n(.*?)```", (pathlib.Path(__file__).parents[2] / "README.md").read_text(), re.DOTALL
-    )
+    """Section 6.7, as the guide has it: the mass comes back to the belt just as this could hold it with the slip force."""
+    page = pathlib.Path(__file__).parents[2] / "docs" / "guide" / "two_parameters.md"
+    blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
     (block,) = [b for b in blocks if "continue_bifurcation" in b]
     shown: dict[str, Any] = dict(nsjax=nsjax)
     exec(block, shown)
