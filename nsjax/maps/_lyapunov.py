@@ -220,7 +220,7 @@ def lyapunov_spectrum(
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     max_steps: int = 4096,
-    max_events: int = 64,
+    max_events: int = 256,
     throw: bool = True,
 ) -> LyapunovSpectrum:
     """The Lyapunov exponents of a solution: a basis of perturbations is carried along the flow, jumps at events

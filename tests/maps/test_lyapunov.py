@@ -160,7 +160,7 @@ def largest(system, starts, transient, span):
     """Of many solutions: the mean, and its standard error."""
 
     def lane(y0):
-        kwargs = dict(transient=transient, span=span, exponents=1, max_events=32, throw=False)
+        kwargs = dict(transient=transient, span=span, exponents=1, throw=False)
         return nsjax.lyapunov_spectrum(system, y0, **kwargs).exponents[0]
 
     found = np.asarray(nsjax.sweep(lane, starts))

@@ -174,7 +174,7 @@ def _across(system, begin, h, x, v, mode, p, q):
         x[active], v[active], mode[active], p[active], q[active] = x1, v1, mode1, p1, q1
         t[active], left[active] = t1, left[active] - tau
         active = active[event & (left[active] > 0)]
-    x[active] = np.nan
+    x[active], p[active] = np.nan, np.nan
     return x, v, mode, p, q
 
 
