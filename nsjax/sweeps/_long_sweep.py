@@ -63,8 +63,8 @@ class Sweep:
     - `fn`, `args`: as for `sweep`. Arrays may lie on the disk (`numpy.load(..., mmap_mode="r")`): no more than a few
         blocks of them, and of what is returned, are in memory at any time.
     - `path`: the folder. It is made if it is not there; that of another sweep is refused.
-    - `block`: how many lanes are computed and written together, a multiple of `chunk`. Where `fn` returns much, such as
-        all events of a solution, take fewer.
+    - `block`: how many lanes are computed and written together, a multiple of `chunk`; by default 65536. Where `fn`
+        returns much, such as all events of a solution, take fewer.
     - `chunk`: how many lanes go together, by default 256 on a CPU and a block on other devices.
     - `devices`: a number of devices, a list of them, or a `jax.sharding.Mesh`, of this process; by default one. The
         result does not depend on it.
