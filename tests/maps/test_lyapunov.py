@@ -2,15 +2,18 @@
 
 from typing import NamedTuple
 
+import branch_reference
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from exponents import ImpactOscillator, largest_exponent, mean_of_finite, StickSlip
-from models import PeriodicHammer
+from models import PeriodicHammer, pid
+from tent import Corner
 
 import nsjax
+from nsjax import gallery
 from nsjax.gallery import Motion
 
 
@@ -22,11 +25,11 @@ class Beats(NamedTuple):
 class Tent(nsjax.System):
     """At each beat x is mapped onto a tent: its exponent is the logarithm of the slope, and that of the phase is 0."""
 
-    slope: float = 1.9
-    slow: float = 1.0
+    rise: float = 1.9
+    fall: float = 1.9
 
     def vector_field(self, t, y, s):
-        return Beats(jnp.zeros_like(y.x), self.slow + jnp.zeros_like(y.phase))
+        return Beats(jnp.zeros_like(y.x), jnp.ones_like(y.phase))
 
     @nsjax.impact
     def beat(self, t, y):
@@ -34,7 +37,7 @@ class Tent(nsjax.System):
 
     @beat.reset
     def beat(self, t, y):
-        return Beats(self.slope * jnp.minimum(y.x, 1 - y.x), y.phase - 1)
+        return Beats(jnp.minimum(self.rise * y.x, self.fall * (1 - y.x)), y.phase - 1)
 
 
 class Damped(nsjax.System):
@@ -90,7 +93,7 @@ def test_the_tent_map():
     def spectrum(slope):
         start = Beats(0.3712, 0.25)
         kwargs = dict(transient=100, span=20, interval=1.0, divergence=True, max_events=4)  # 1.5**-100 is nothing
-        return nsjax.lyapunov_spectrum(Tent(slope), start, **kwargs)
+        return nsjax.lyapunov_spectrum(Tent(slope, slope), start, **kwargs)
 
     slopes = np.array([1.5, 1.7, 1.9])
     found = jax.jit(jax.vmap(spectrum))(jnp.asarray(slopes))
@@ -100,6 +103,21 @@ def test_the_tent_map():
     np.testing.assert_allclose(found.history[:, -1], found.exponents, atol=1e-14)
     np.testing.assert_allclose(found.dimension, 2)
     assert "3 spectra of 2" in str(found)
+
+
+@pytest.mark.slow
+def test_a_skew_tent():
+    """Onto the whole interval: the measure is uniform, and the exponent H = -p ln p - (1 - p) ln(1 - p). After n beats the
+    pieces are multiples of 4^-n, for p = 1/4: one start in the middle of each gives the mean without an error."""
+    p, beats = 0.25, 4
+
+    def growth(x):
+        kwargs = dict(transient=0, span=beats, interval=1.0, max_events=4)
+        return jnp.sum(nsjax.lyapunov_spectrum(Tent(1 / p, 1 / (1 - p)), Beats(x, 0.25), **kwargs).exponents)
+
+    found = nsjax.sweep(growth, (jnp.arange(4.0**beats) + 0.5) / 4**beats)  # the other exponent is 0
+    assert float(jnp.mean(found)) == pytest.approx(-p * np.log(p) - (1 - p) * np.log(1 - p), abs=1e-12)
+    assert float(jnp.std(found)) > 0.1
 
 
 def test_decay_of_a_linear_system():
@@ -198,3 +216,67 @@ def test_the_sum_of_exponents_in_chaos():
     assert abs(float(found.residual)) < 1e-7
     impacts = (float(found.divergence) + STOPPED.c) * 200 * float(found.interval) / np.log(0.8**2)
     assert impacts == pytest.approx(round(impacts), abs=1e-6) and impacts > 100
+
+
+def beside_b():
+    """The closed form, and the point."""
+    point = branch_reference.POINTS["6.9 B"]
+    return Corner(point.multipliers["stick"][0], point.multipliers["no stick"]).pieces(), point
+
+
+def test_closed_form_beside_b():
+    """Against the map itself, which knows nothing of pieces; and the sums have converged."""
+    pieces, point = beside_b()
+    corner = Corner(point.multipliers["stick"][0], point.multipliers["no stick"])
+    stuck = corner.iterated(np.linspace(0.25, 0.3, 2000), np.zeros(2000), 1100)[100:]
+    laps = [np.diff(np.flatnonzero(lane)) for lane in stuck.T]
+    means = np.array([[np.log(pieces.growths[k // 2 - 1]).sum(), k.sum()] for k in laps])
+    exponent = means[:, 0].sum() / means[:, 1].sum()
+    error = np.std(means[:, 0] - exponent * means[:, 1]) / means[:, 1].mean() / 2000**0.5
+    assert error < 2e-4 and abs(exponent - pieces.exponent) < 3 * error
+    assert list(pieces.laps) == [2, 4, 6, 8, 10, 12] and pieces.exponent == pytest.approx(0.33087804815, abs=1e-11)
+    assert corner.pieces(20).exponent == pytest.approx(pieces.exponent, abs=1e-13)
+
+
+@pytest.mark.slow
+def test_the_tent_at_b():
+    """Section 6.9, ω -> ω_B from above: what the spectrum of the system itself finds to grow from one stick to the next
+    tends to the slopes of the map at B, like √(ω - ω_B), and the exponent to the closed form to 1e-6 [1/s]."""
+    pieces, point = beside_b()
+    logs, order, lanes, span = dict(zip(pieces.laps, np.log(pieces.growths))), point.order, 64, 400
+
+    def rates(omega, x):
+        system, y0 = gallery.ForcedStickSlip(omega=omega), Motion(x, jnp.asarray(point.y0[1]))
+        options = dict(transient=20, span=span, max_events=8, stepsize_controller=pid(1e-13))
+        return nsjax.lyapunov_spectrum(system, y0, **options, throw=False).rates
+
+    rates, exponents = jax.jit(jax.vmap(rates, (None, 0))), []
+    for distance in (1e-6, 1e-8, 1e-10):
+        omega = point.at + distance
+        found = rates(omega, point.y0[0] + distance * jnp.linspace(-2, 2, lanes)) * (2 * np.pi / omega)
+        found = np.asarray(found).reshape(lanes, span // order, order, 2)
+        assert not np.isnan(found).any() and np.isfinite(found[..., 0]).all()
+        grown = found[..., 0].sum(axis=2)
+        stuck = np.isinf(found[..., 1]).any(axis=2)  # sticking forgets: the other exponent says when
+        ends = [np.flatnonzero(lane) for lane in stuck]
+        laps = np.concatenate([np.diff(end) for end in ends])
+        growth = np.concatenate([np.diff(np.cumsum(lane)[end]) for lane, end in zip(grown, ends)])
+        # Others are possible a little away from B, and next to it by rounding.
+        usual = np.isin(laps, pieces.laps)
+        assert usual.mean() > 0.999
+        laps, growth = laps[usual], growth[usual]
+        off = growth - np.array([logs[k] for k in laps])
+        assert np.abs(off).max() < 1.2 * distance**0.5
+        # With the shares of the invariant measure: an average of the solutions themselves would need 1e11 periods.
+        means = np.array([growth[laps == k].mean() for k in pieces.laps])
+        exponents.append(pieces.shares @ means / (pieces.shares @ pieces.laps))
+        # That the solutions have these shares, to three standard errors.
+        shares = np.array([np.mean(laps == k) for k in pieces.laps])
+        errors = np.sqrt(pieces.shares * (1 - pieces.shares) / len(laps))
+        assert errors.max() < 0.01 and (np.abs(shares - pieces.shares) < 3 * errors).all()
+        each = grown.mean(axis=1)
+        assert abs(each.mean() - pieces.exponent) < 3 * each.std(ddof=1) / lanes**0.5 < 0.01
+    far, near, next_to = np.array(exponents) - pieces.exponent
+    assert far / near == pytest.approx(10, rel=0.1) and near / next_to == pytest.approx(10, rel=0.1)
+    assert abs(next_to) / point.period < 1e-6
+    assert abs(10 * next_to - near) / 9 < 3e-7

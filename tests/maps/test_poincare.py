@@ -1,5 +1,6 @@
 """Poincaré maps of sections and of the forcing's phase, reduced maps, and brute-force diagrams, against closed forms."""
 
+import branch_reference
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -393,6 +394,24 @@ def test_reduced_map_meets_the_diagonal_at_orbits(branch):
     # By the implicit function theorem, from the exact monodromy matrix.
     (a, b), (c, d) = exact.monodromy
     np.testing.assert_allclose(slope, a + b * c / (1 - d), rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_reduced_map_is_a_tent_at_b():
+    """At point B its tip is on the diagonal; its limbs there are those of the exact monodromy matrices, with stick to the
+    left, which is approached like a square root, and without. Both are steeper than 1."""
+    point = branch_reference.POINTS["6.9 B"]
+    x, v = point.y0
+    slip, stick = (a + b * c / (1 - d) for (a, b), (c, d) in branch_reference.belt_touch_monodromies("B"))
+    found, slopes = jax.vmap(reduced_with_slope, (None, 0, None))(
+        BELT.__class__(omega=point.at), x + 1e-6 * jnp.array([-16.0, -4.0, -1.0, 0.0, 1.0, 4.0]), jnp.asarray(v)
+    )
+    assert np.all(found.result == RESULTS.successful)
+    np.testing.assert_allclose(found.value[3], x, atol=1e-9)
+    near = 2 * slopes[1:3] - slopes[:2]
+    np.testing.assert_allclose((4 * near[1] - near[0]) / 3, stick, rtol=1e-4)
+    np.testing.assert_allclose(slopes[4:], slip, rtol=1e-5)
+    assert stick > 1 and slip < -1
 
 
 @pytest.fixture(scope="module")

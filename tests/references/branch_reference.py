@@ -500,6 +500,18 @@ def belt_touch(which: str) -> Point:
 
 
 @cache
+def belt_touch_monodromies(which: str) -> tuple[np.ndarray, np.ndarray]:
+    """Over whole periods of the forcing from its phase 0, at A, B or C of section 6.9: without stick, and with it."""
+    order, *guess = TOUCHES[which]
+    omega, t0 = _solve(lambda *z: _after_stick(order, mp.zero, *z)[0], *guess)
+    p, period = Belt(omega=omega), 2 * mp.pi * order / omega
+    x0 = _leaves(p, t0)
+    whole, rest = (_belt(p, t0, x0, p.v_dr, end)[2] for end in (t0 + period, period))
+    there = [rest * stick * whole * rest**-1 for stick in (mp.eye(2), mp.diag([1, 0]))]
+    return tuple(np.array(m.tolist(), float) for m in there)  # pyright: ignore[reportReturnType]
+
+
+@cache
 def belt_stick_orbit(which: str, stick: float) -> tuple[Any, Any]:
     """(ω, multiplier) of the orbit with a stick phase of this duration, on the branch that ends at A, B or C."""
     order, *guess = TOUCHES[which]
