@@ -16,6 +16,7 @@ from .._numerics._text import positive
 from .._types import Scalar, Y
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
+from ..flow._solution import Solution
 from ..flow._solve import integrate
 from ..flow.events._initial_mode import AT_ONCE
 from ..system._clock import clock
@@ -103,15 +104,18 @@ class _Section(PoincareMap):
         on = (jnp.abs(h) <= at_once * jnp.abs(rate)) & (rate != 0)
         return *others, jnp.where(on, jnp.sign(rate).astype(jnp.int32), side)
 
-    def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
+    def passage(
+        self, system: System, here: tuple[Scalar, Scalar, Y], mode: Any, still: bool = False
+    ) -> tuple[Scalar, Y, RESULTS, Solution]:
+        _, t, y = here
         end = t + self.max_time
-        sol = integrate(system, t, end, y, self.integrator, mode=mode)
+        sol = integrate(system, t, end, y, self.integrator, mode=mode, still=still)
         late = is_okay(sol.result) & ~(sol.t1 < end)
         y1 = sol.y1
         for switch in system.switches:
             if isinstance(switch, impact) and switch.ends:
                 y1 = _onto(switch, system, sol.t1, y1)
-        return sol.t1, y1, sol.mode1, RESULTS.where(late, RESULTS.no_return, sol.result)
+        return sol.t1, y1, RESULTS.where(late, RESULTS.no_return, sol.result), sol
 
 
 def _onto(switch: AbstractSwitch, system: System, t: Scalar, y: Y) -> Y:

@@ -1,0 +1,94 @@
+"""Classes of itineraries: the events of one time around an attractor, whichever comes first."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from ..system._clock import clock
+from ..system._impact import impact
+from ..system._relay import relay
+from ..system._sgn import sgn
+from ..system._switch import AbstractSwitch
+from ..system._system import System
+
+
+NONE = -1  # of an itinerary that is not known, or longer than what is kept of it
+
+# A row is the switch whose event it is, and the modes of all switches after it; -1 instead of a switch where nothing
+# happens all the time.
+Rows = Int[np.ndarray, "events switches+1"]
+
+
+def mode_row(system: System, mode: Int[Array, " more"]) -> Int[Array, " switches"]:
+    """Without those that a section adds. Of a clock all ticks are alike: it never comes back to a mode."""
+    still = [0 if isinstance(s, clock) else 1 for s in system.switches]
+    return mode[: len(still)].astype(jnp.int8) * jnp.asarray(still, jnp.int8)
+
+
+@dataclasses.dataclass
+class ItineraryClasses:
+    """A table of those that were met."""
+
+    system: System
+    words: list[str] = dataclasses.field(default_factory=list)
+    _seen: dict[bytes, int] = dataclasses.field(default_factory=dict)
+    _known: dict[bytes, int] = dataclasses.field(default_factory=dict)
+
+    def of(self, rows: Int[np.ndarray, "lanes most switches+1"], counts: Int[np.ndarray, " lanes"]) -> np.ndarray:
+        """The class of each of many itineraries of so many events; `NONE` where there is no room for all of them."""
+        lanes, most, _ = rows.shape
+        if not lanes:
+            return np.zeros(0, int)
+        rows = np.where(np.arange(most)[:, None] < np.maximum(counts, 1)[:, None, None], rows, 0)
+        text = np.concatenate([rows.reshape(lanes, -1), counts.astype(np.int32)[:, None].view(np.int8)], axis=1)
+        _, first, which = np.unique(text, axis=0, return_index=True, return_inverse=True)
+        found = [self._class(rows[i, : max(1, counts[i])]) if counts[i] <= most else NONE for i in first]
+        return np.array(found, int)[np.ravel(which)]
+
+    def _class(self, rows: Rows) -> int:
+        key = rows.tobytes()
+        if key not in self._seen:
+            first = min(range(len(rows)), key=lambda i: np.roll(rows, -i, axis=0).tobytes())
+            rows = np.roll(rows, -first, axis=0)
+            least = rows.tobytes()
+            if least not in self._known:
+                self._known[least] = len(self.words)
+                self.words.append(itinerary_words(self.system, rows))
+            self._seen[key] = self._known[least]
+        return self._seen[key]
+
+
+def itinerary_words(system: System, rows: Rows) -> str:
+    """As they are printed: `belt0 belt+ belt-`; events that follow one another and are alike by their number."""
+    switches = system.switches
+    if rows[0, 0] < 0:
+        words = ", ".join(filter(None, (_mode_word(s, int(m)) for s, m in zip(switches, rows[0, 1:]))))
+        return f"no event: {words}" if words else "no event"
+    out: list[list] = []
+    for before, row in zip(np.roll(rows, 1, axis=0), rows):
+        k = int(row[0])
+        others = (j for j in range(len(switches)) if j != k and row[1 + j] != before[1 + j])
+        word = _event_word(switches[k], int(before[1 + k]), int(row[1 + k]))
+        word = ",".join([word, *(_event_word(switches[j], int(before[1 + j]), int(row[1 + j])) for j in others)])
+        if out and out[-1][0] == word:
+            out[-1][1] += 1
+        else:
+            out.append([word, 1])
+    return " ".join(word + f" ×{number}" * (number > 1) for word, number in out)
+
+
+def _event_word(switch: AbstractSwitch, before: int, after: int) -> str:
+    """What happens: for a contact that is not rested upon the impact itself."""
+    if isinstance(switch, impact):
+        return f"{switch.name}:rests" if after else f"{switch.name}:leaves" if before else switch.name
+    return _mode_word(switch, after) or switch.name
+
+
+def _mode_word(switch: AbstractSwitch, mode: int) -> str:
+    if isinstance(switch, sgn):
+        return f"{switch.name}{('0', '+', ':off', '-')[mode]}"
+    if isinstance(switch, relay):
+        return f"{switch.name}:{'on' if mode else 'off'}"
+    return f"{switch.name}:rests" if isinstance(switch, impact) and mode else ""
