@@ -50,6 +50,7 @@ class ItineraryClasses:
     def _class(self, rows: Rows) -> int:
         key = rows.tobytes()
         if key not in self._seen:
+            rows = _accumulated(self.system, rows)
             first = min(range(len(rows)), key=lambda i: np.roll(rows, -i, axis=0).tobytes())
             rows = np.roll(rows, -first, axis=0)
             least = rows.tobytes()
@@ -60,6 +61,23 @@ class ItineraryClasses:
         return self._seen[key]
 
 
+def _accumulated(system: System, rows: Rows) -> Rows:
+    """Impacts that lead to rest are infinitely many, of which as many were made as the tolerance wants: one stands for
+    all of them."""
+    before = np.roll(rows, 1, axis=0)
+    resting = [isinstance(s, impact) for s in system.switches]
+    keep, n = np.ones(len(rows), bool), len(rows)
+    for i, row in enumerate(rows):
+        k = row[0]
+        if k >= 0 and resting[k] and row[1 + k] == 1 and before[i, 1 + k] == 0:
+            j = i - 2
+            # (The row of leaving the surface is that of an impact, but for what was before it.)
+            while j > i - n and (rows[j % n] == rows[(j + 1) % n]).all() and before[j % n, 1 + k] == 0:
+                keep[(j + 1) % n] = False
+                j -= 1
+    return rows[keep]
+
+
 def itinerary_words(system: System, rows: Rows) -> str:
     """As they are printed: `belt0 belt+ belt-`; events that follow one another and are alike by their number."""
     switches = system.switches
@@ -67,11 +85,13 @@ def itinerary_words(system: System, rows: Rows) -> str:
         words = ", ".join(filter(None, (_mode_word(s, int(m)) for s, m in zip(switches, rows[0, 1:]))))
         return f"no event: {words}" if words else "no event"
     out: list[list] = []
-    for before, row in zip(np.roll(rows, 1, axis=0), rows):
+    for before, row, after in zip(np.roll(rows, 1, axis=0), rows, np.roll(rows, -1, axis=0)):
         k = int(row[0])
         others = (j for j in range(len(switches)) if j != k and row[1 + j] != before[1 + j])
         word = _event_word(switches[k], int(before[1 + k]), int(row[1 + k]))
         word = ",".join([word, *(_event_word(switches[j], int(before[1 + j]), int(row[1 + j])) for j in others)])
+        if after[0] == k and isinstance(switches[k], impact) and row[1 + k] == 0 and after[1 + k] == 1:
+            word += " ×∞"  # and then at rest
         if out and out[-1][0] == word:
             out[-1][1] += 1
         else:

@@ -45,6 +45,7 @@ class Seen(NamedTuple):
 
     here: Here
     period: Int[Array, ""]  # 0 where it has not settled
+    rate: Scalar  # at which the perturbation grew over whole times around [1/time]
     growth: Float[Array, " parts"]  # logarithms of the growth of the perturbation
     times: Float[Array, " parts"]
     events: Int[Array, "kept switches+1"]  # of one time around, in their order
@@ -96,7 +97,10 @@ class Window(eqx.Module):
         t, x, mode, w, result, log, total = carry
         # An orbit that repels may be followed for a while too, by a start that lies on it.
         period = jnp.where(jnp.sum(grown[-self.iterates // 2 :]) > GROWN, 0, settled(points, self.tol))
-        last = jnp.arange(self.iterates - 1, -1, -1, dtype=period.dtype) < period
+        ago = jnp.arange(self.iterates - 1, -1, -1, dtype=period.dtype)
+        last, half = ago < period, self.iterates // 2
+        around = ago < half - half % jnp.maximum(period, 1)
+        rate = jnp.sum(jnp.where(around, grown, 0)) / jnp.sum(jnp.where(around, times, 0))
         count = jnp.sum(jnp.where(last, numbers, 0)).astype(jnp.int32)
         log = jnp.roll(log, jnp.minimum(count, KEPT) - total, axis=0)
         nothing = jnp.concatenate([jnp.full((1,), -1, jnp.int8), mode_row(system, mode)])
@@ -106,7 +110,7 @@ class Window(eqx.Module):
             return jnp.sum(x.reshape(PARTS, -1), axis=1)
 
         here = Here(t, x, mode, w, jnp.zeros((), bool))
-        return Seen(here, period, by_part(grown), by_part(times), log, count, result)
+        return Seen(here, period, rate, by_part(grown), by_part(times), log, count, result)
 
 
 def direction_of(n: int) -> np.ndarray:
@@ -190,8 +194,7 @@ class Pursuit(NamedTuple):
             out.x[left], out.result[left] = seen.here.x, codes
             out.periods[left] = np.where(good, seen.period, -1)
             each = good & done
-            half = [np.sum(a[each, PARTS // 2 :], axis=1) for a in (seen.growth, seen.times)]
-            out.exponents[left[each]] = half[0] / half[1]
+            out.exponents[left[each]] = seen.rate[each]
             out.classes[left[each]] = classes.of(seen.events[each], seen.count[each])
             late = [(g[~done], t[~done]) for g, t in [*late, (seen.growth, seen.times)]][-max(1, (k + 2) // 2) :]
             left, here = left[~done], jax.tree.map(lambda a, keep=~done: np.asarray(a)[keep], seen.here)
