@@ -79,24 +79,37 @@ def _accumulated(system: System, rows: Rows) -> Rows:
 
 
 def itinerary_words(system: System, rows: Rows) -> str:
-    """As they are printed: `belt0 belt+ belt-`; events that follow one another and are alike by their number."""
+    """As they are printed: `belt0 belt+ belt-`, `(belt0 belt-)×2 belt+`."""
     switches = system.switches
     if rows[0, 0] < 0:
         words = ", ".join(filter(None, (_mode_word(s, int(m)) for s, m in zip(switches, rows[0, 1:]))))
         return f"no event: {words}" if words else "no event"
-    out: list[list] = []
+    words = []
     for before, row, after in zip(np.roll(rows, 1, axis=0), rows, np.roll(rows, -1, axis=0)):
         k = int(row[0])
         others = (j for j in range(len(switches)) if j != k and row[1 + j] != before[1 + j])
         word = _event_word(switches[k], int(before[1 + k]), int(row[1 + k]))
         word = ",".join([word, *(_event_word(switches[j], int(before[1 + j]), int(row[1 + j])) for j in others)])
-        if after[0] == k and isinstance(switches[k], impact) and row[1 + k] == 0 and after[1 + k] == 1:
-            word += " ×∞"  # and then at rest
-        if out and out[-1][0] == word:
-            out[-1][1] += 1
-        else:
-            out.append([word, 1])
-    return " ".join(word + f" ×{number}" * (number > 1) for word, number in out)
+        at_rest = isinstance(switches[k], impact) and before[1 + k] == row[1 + k] == 0
+        words.append(word + "×∞" * bool(at_rest and after[0] == k and after[1 + k] == 1))
+    return _shortened(words)
+
+
+def _shortened(words: list[str]) -> str:
+    """What is repeated at once is written once, with its number: from each place on that which is then the longest."""
+    out, i = [], 0
+    while i < len(words):
+        best, times = 1, 1
+        for size in range(1, (len(words) - i) // 2 + 1):
+            number = 1
+            while words[i + number * size : i + (number + 1) * size] == words[i : i + size]:
+                number += 1
+            if number > 1 and number * size > best * times:
+                best, times = size, number
+        part = " ".join(words[i : i + best])
+        out.append(part if times == 1 else f"({part})×{times}" if best > 1 else f"{part}×{times}")
+        i += best * times
+    return " ".join(out)
 
 
 def _event_word(switch: AbstractSwitch, before: int, after: int) -> str:

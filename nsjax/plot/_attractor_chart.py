@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 CHAOS, UNDECIDED, FAILED = "0.15", "white", "0.75"
 COLOURS = ("#4477aa", "#66ccee", "#228833", "#ccbb44", "#ee6677", "#aa3377", "#e69f00", "#88ccaa", "#bb8866", "#9988dd")
 OTHERS = "0.55"  # of those beyond the ten that have a colour of their own
+LONGEST = 30  # characters of an itinerary in the legend
 BOX = dict(marker="s", linestyle="none", markersize=8, markeredgecolor="0.5", markeredgewidth=0.5)
 Shown = Literal["period", "itinerary", "exponent"]
 
@@ -61,10 +62,14 @@ def attractor_chart(
             own = [*zip(range(3, 3 + len(COLOURS)), names), (3 + len(COLOURS), "others")]
             for k, name in [*own, (2, "chaos"), (1, "undecided"), (0, "failed")]:
                 if (code == k).any() or (name == "others" and (code > k).any()):
-                    ax.plot([], [], markerfacecolor=colours[k], label=name, **BOX)
-            add_legend(ax)
+                    ax.plot([], [], markerfacecolor=colours[k], label=_short(name), **BOX)
+            add_legend(ax, 3 if by == "period" else 2)
     ax.set(xlabel=axis_label(labels, found.parameters[0]), ylabel=axis_label(labels, found.parameters[1]))
     return ax
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= LONGEST else f"{name[: LONGEST - 1]}…"
 
 
 def _periods(found: AttractorChart) -> tuple[np.ndarray, list[str]]:

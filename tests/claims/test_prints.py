@@ -98,7 +98,7 @@ SPECTRUM = nsjax.maps.LyapunovSpectrum(
 BASINS = nsjax.maps.Basins(np.array([0, 0, -1]), (Motion(*jnp.ones((2, 1))),), np.ones(3, int), ROWS, np.zeros(3, int))
 CHART = nsjax.maps.AttractorChart(
     ("omega", "e"), (np.array([1.0, 2.0]), np.array([0.5])), np.array([[2], [0]]), np.array([[0], [-1]]),
-    ("wall ×2",), np.array([[False], [True]]), np.ones((2, 1)), np.ones((2, 1)), np.ones((2, 1), int), ROWS,
+    ("wall×2",), np.array([[False], [True]]), np.ones((2, 1)), np.ones((2, 1)), np.ones((2, 1), int), ROWS,
     np.zeros((2, 1), int),
 )  # fmt: skip
 ITERATE = nsjax.maps.Iterate(jnp.asarray(6.25), STATE, jnp.array([-1, 1]), GOOD)

@@ -1,5 +1,6 @@
 """Charts of attractors: every label against what is known, or against an independent simulation."""
 
+import re
 from typing import NamedTuple
 
 import jax
@@ -88,7 +89,7 @@ def test_every_label_of_the_logistic_map(logistic):
                 change = (points > middle) != (np.roll(points, 1) > middle)
                 words = np.where(change, np.where(points > middle, "beat,side+", "beat,side-"), "beat")
                 word = logistic.itineraries[logistic.classes[i, j]]
-                mine = [w for part in _parts(word) for w in part]
+                mine = _expanded(word)
                 assert any(mine == list(np.roll(words, k)) for k in range(period))
             elif logistic.chaotic[i, j]:
                 assert abs(logistic.exponents[i, j] - rate) < 5 * logistic.errors[i, j] < 0.2
@@ -96,15 +97,10 @@ def test_every_label_of_the_logistic_map(logistic):
     assert logistic.exponents[-1, 0] == pytest.approx(np.log(2), abs=5 * logistic.errors[-1, 0])
 
 
-def _parts(words):
-    """`beat,side+ beat ×2` as the words it stands for."""
-    out = []
-    for word in words.split():
-        if word.startswith("×"):
-            out[-1] *= int(word[1:])
-        else:
-            out.append([word])
-    return out
+def _expanded(words):
+    """`(beat,side+ beat)×2 beat×2` as the words it stands for."""
+    words = re.sub(r"\(([^)]*)\)×(\d+)", lambda m: " ".join([m[1]] * int(m[2])), words)
+    return re.sub(r"(\S+)×(\d+)", lambda m: " ".join([m[1]] * int(m[2])), words).split()
 
 
 def test_lanes_do_not_wait(logistic):
@@ -191,12 +187,12 @@ def test_impacts_that_lead_to_rest():
     found = classes.of(rows, np.array([len(way) for way in ways]))
     assert found[0] == found[1]
     words = [classes.words[k] for k in found]
-    assert _cyclic("wall ×∞ wall:rests wall:leaves", words[0]) and _cyclic("wall:rests wall:leaves", words[2])
-    assert words[3] == "wall ×3"
+    assert _cyclic("wall×∞ wall:rests wall:leaves", words[0]) and _cyclic("wall:rests wall:leaves", words[2])
+    assert words[3] == "wall×3"
 
 
 def _cyclic(wanted, words):
-    wanted, words = (text.replace(" ×", "×").split() for text in (wanted, words))
+    wanted, words = wanted.split(), words.split()
     return any(words == wanted[k:] + wanted[:k] for k in range(len(wanted)))
 
 
@@ -262,7 +258,7 @@ def test_every_label_of_an_impact_oscillator():
                 here = -np.array([found.ys.x[i, j], found.ys.v[i, j]])
                 assert np.abs(points[:period] - here).max(axis=1).min() < 1e-5
                 words = found.itineraries[found.classes[i, j]]
-                assert sum(map(len, _parts(words))) == _impacts(known, points[0], period)
+                assert len(_expanded(words)) == _impacts(known, points[0], period)
             elif found.chaotic[i, j]:
                 with np.errstate(all="ignore"):  # some solutions come to rest, and count for nothing
                     rate, error = largest_exponent(known, 32, 200, 400, steps=24)
