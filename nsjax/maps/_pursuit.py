@@ -179,9 +179,8 @@ class Pursuit(NamedTuple):
     path: str | os.PathLike | None
 
     def followed(self, rounds: int) -> Found:
-        out = Labels.blank(len(self.values), *self._start().x.shape[1:], self.values.dtype)
-        classes = ItineraryClasses(self.window.system)
         left, here = np.arange(len(self.values)), self._start()
+        out, classes = Labels.blank(*here.x.shape, here.x.dtype), ItineraryClasses(self.window.system)
         late: list[tuple[np.ndarray, np.ndarray]] = []  # growth and times in the second half
         for k in range(rounds):
             folder = None if self.path is None else os.path.join(self.path, f"{k:04d}")

@@ -98,7 +98,7 @@ def _mesh(ax: "Axes", across: np.ndarray, up: np.ndarray, code: np.ndarray, colo
 def _exponents(ax: "Axes", found: AttractorChart, labels: Labels, legend: bool) -> None:
     rates = np.ma.masked_invalid(np.where(found.exponents == -np.inf, -1e300, found.exponents))
     finite = found.exponents[np.isfinite(found.exponents)]
-    most = max(float(np.quantile(np.abs(finite), 0.98)) if finite.size else 0.0, 1e-12)
+    most = max(float(np.quantile(np.abs(finite), 0.9)) if finite.size else 0.0, 1e-12)
     ax.set_facecolor(FAILED)
     kwargs: dict[str, Any] = dict(cmap="RdBu_r", vmin=-most, vmax=most)
     mesh = ax.pcolormesh(*found.values, rates.T, shading="nearest", rasterized=True, **kwargs)
