@@ -18,7 +18,7 @@ from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
 from ..flow._results import RESULTS
 from ..sweeps._devices import Devices, devices_of
-from ..sweeps._lanes import default_chunk
+from ..sweeps._lanes import default_chunk, even_chunks
 from ..system._parameter import parameter_path
 from ..system._system import arrays_of, System
 from ._map_of import map_of
@@ -170,7 +170,7 @@ def attractor_chart(
     if chunk is None:
         chunk = default_chunk(min(shape[0] * shape[1], 65536), devices_of(devices)[0].platform)
     positive("chunk", chunk)
-    chunk = min(chunk, shape[0] * shape[1])
+    _, chunk = even_chunks(shape[0] * shape[1], chunk)
     window = Window(system, paths, step, t0, start, 4 * max_period, jnp.asarray(tol, t0.dtype))
     pairs = np.stack([a.ravel() for a in np.meshgrid(*values, indexing="ij")], axis=-1)
     found = Pursuit(window, pairs, chunk, devices, path).followed(-(-max_iterates // window.iterates))
