@@ -59,17 +59,19 @@ def attractor_chart(
         code = np.where(found.chaotic, 2, np.where(found.failed, 0, np.where(own >= 0, 3 + own, 1)))
         _mesh(ax, across, up, code, colours)
         if legend:
-            own = [*zip(range(3, 3 + len(COLOURS)), names), (3 + len(COLOURS), "others")]
+            own = [*zip(range(3, 3 + len(COLOURS)), _shortened(names[: len(COLOURS)])), (3 + len(COLOURS), "others")]
             for k, name in [*own, (2, "chaos"), (1, "undecided"), (0, "failed")]:
                 if (code == k).any() or (name == "others" and (code > k).any()):
-                    ax.plot([], [], markerfacecolor=colours[k], label=_short(name), **BOX)
+                    ax.plot([], [], markerfacecolor=colours[k], label=name, **BOX)
             add_legend(ax, 3 if by == "period" else 2)
     ax.set(xlabel=axis_label(labels, found.parameters[0]), ylabel=axis_label(labels, found.parameters[1]))
     return ax
 
 
-def _short(name: str) -> str:
-    return name if len(name) <= LONGEST else f"{name[: LONGEST - 1]}…"
+def _shortened(names: list[str]) -> list[str]:
+    """Long ones by their beginning and end, where these tell them apart: a legend shows each text once."""
+    short = [n if len(n) <= LONGEST else f"{n[: LONGEST - 11]}…{n[-10:]}" for n in names]
+    return [n if short.count(s) > 1 else s for n, s in zip(names, short)]
 
 
 def _periods(found: AttractorChart) -> tuple[np.ndarray, list[str]]:

@@ -1,5 +1,6 @@
 """Pictures: what is drawn is the solution, cut at its events; nothing global changes."""
 
+import dataclasses
 import functools
 import types
 from typing import NamedTuple
@@ -398,6 +399,9 @@ def test_attractor_chart():
         want = [[names[0], "undecided"], [names[1], "failed"], ["chaos", names[2]]]
         np.testing.assert_allclose(cells, [[colour[name] for name in row] for row in want], atol=1e-6)
         assert len({tuple(c) for c in colour.values()}) == 6
+    ends = [f"belt0 {'belt- belt+ ' * 9}{end}" for end in ("belt0", "belt-", "belt- belt0")]
+    many = dataclasses.replace(found, itineraries=tuple(ends), classes=np.array([[0, 1, -1], [-1, -1, 2]]))
+    assert len(legend_names(plot.attractor_chart(many, "itinerary"))) == 6
     ax = plot.attractor_chart(found, "exponent", labels={"exponent": "λ₁ [1/s]"})
     (mesh,) = ax.collections
     low, high = mesh.get_clim()
