@@ -180,7 +180,7 @@ class Pursuit(NamedTuple):
 
     def followed(self, rounds: int) -> Found:
         left, here = np.arange(len(self.values)), self._start()
-        out, classes = Labels.blank(*here.x.shape, here.x.dtype), ItineraryClasses(self.window.system)
+        out, classes = Labels.blank(len(left), here.x.shape[1], here.x.dtype), ItineraryClasses(self.window.system)
         late: list[tuple[np.ndarray, np.ndarray]] = []  # growth and times in the second half
         for k in range(rounds):
             folder = None if self.path is None else os.path.join(self.path, f"{k:04d}")
