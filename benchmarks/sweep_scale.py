@@ -5,6 +5,8 @@
 Workload S1 by Dopri8 (`workloads.py`), and a cheap one: a tenth of it. What is compared is run in turns in one process
 of two devices, and ratios are medians of the ratios within a turn. Memory is the largest that a process of its own came
 to; pages of files that are mapped are in the second number only: the system takes those back when it needs them.
+
+Beside the numbers, a picture of throughput and of chunks is drawn; `--parts` alone, with no part, draws it once more.
 """
 
 import argparse
@@ -21,6 +23,7 @@ from typing import Any
 
 import diffrax
 import jax
+import matplotlib.pyplot as plt
 import numpy as np
 from sweep import machine, slider_lane
 from workloads import belt_velocities, SLIDER
@@ -158,6 +161,33 @@ def memory(numbers: list[int]) -> list[dict[str, Any]]:
     return rows
 
 
+def picture(found: dict[str, Any]) -> plt.Figure:
+    """Throughput against lanes, in memory by devices and in a folder; and what the size of chunks does."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    rows = found["throughput"]
+    for way, colour in (("devices=1", "C0"), ("devices=2", "C1")):
+        own = [(row["lanes"], row["lanes a second"]) for row in rows if row["way"] == way]
+        left.plot(*zip(*own), marker="o", color=colour, label=f"sweep, {way}")
+    folder = [(row["lanes"], row["lanes"] / row["seconds"]) for row in found["memory"]]
+    left.plot(
+        *zip(*folder), marker="s", color="C2", linestyle="--", label="Sweep in a folder, one device, with compiling"
+    )
+    left.set(xscale="log", yscale="log", xlabel="lanes [-]", ylabel="throughput [lanes/s]")
+    left.legend(fontsize="small", frameon=False, loc="lower right")
+    every = {int(row["way"]): row["ratios"] for row in found["chunks"]}
+    middle = [statistics.median(own) for own in every.values()]
+    right.plot([*every], middle, marker="o", color="C0", label="median")
+    low, high = zip(*(np.quantile(own, [0.25, 0.75]) for own in every.values()))
+    right.fill_between([*every], low, high, color="C0", alpha=0.2, linewidth=0, label="half of the runs")
+    right.set(xscale="log", xlabel="chunk [lanes]", ylabel="time, relative to chunks of 256 [-]", ylim=(0, None))
+    right.set_xticks([*every], [str(n) for n in every])
+    right.minorticks_off()
+    right.legend(fontsize="small", frameon=False, loc="lower right")
+    for ax in (left, right):
+        ax.grid(True, which="major", color="0.9")
+    return figure
+
+
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_num_cpu_devices", 2)
@@ -167,14 +197,18 @@ def main() -> None:
     parser.add_argument("--chunks", type=int, nargs="+", default=[64, 128, 256, 512, 1024, 4096])
     parser.add_argument("--numbers", type=int, nargs="+", default=[10**i for i in range(7)])
     parser.add_argument("--memory", type=int, nargs="*", default=[100_000, 10_000_000])
-    parser.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS, help="others stay as they are in the file")
+    parser.add_argument("--parts", nargs="*", default=PARTS, help=f"of {', '.join(PARTS)}; others stay as they are")
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--out", help="where to write the numbers as JSON")
+    parser.add_argument("--out", help="where to write the numbers as JSON, and the picture")
     args = parser.parse_args()
     found: dict[str, Any] = {}
     if args.out and pathlib.Path(args.out).exists():
         found = json.loads(pathlib.Path(args.out).read_text())
-    found["machine"] = machine()
+    unknown = set(args.parts) - set(PARTS)
+    if unknown:
+        parser.error(f"unknown parts: {', '.join(unknown)}")
+    if args.parts:
+        found["machine"] = machine()
     with tempfile.TemporaryDirectory() as root:
         parts = {
             "overhead": lambda: overhead(args.lanes, args.block, args.repeats, root),
@@ -192,6 +226,8 @@ def main() -> None:
             if args.out:
                 with open(args.out, "w") as file:
                     json.dump(found, file, indent=1)
+    if args.out:
+        picture(found).savefig(pathlib.Path(args.out).with_suffix(".png"), dpi=120)
 
 
 if __name__ == "__main__":

@@ -54,6 +54,7 @@ from .flow import (
     Taylor as Taylor,
 )
 from .maps import (
+    attractor_chart as attractor_chart,
     basins as basins,
     brute_force as brute_force,
     lyapunov_spectrum as lyapunov_spectrum,

@@ -1,5 +1,6 @@
 """Poincaré maps, and what they are for: diagrams, basins, Lyapunov exponents, normal forms."""
 
+from ._attractor_chart import attractor_chart as attractor_chart, AttractorChart as AttractorChart
 from ._basins import Basins as Basins, basins as basins
 from ._brute_force import brute_force as brute_force, BruteForce as BruteForce
 from ._iterate import Iterate as Iterate

@@ -22,13 +22,13 @@ from ..orbits._orbit import Orbit
 from ..sweeps._lanes import CHUNK
 from ..system._system import arrays_of, System
 from ._iterate import Iterate, PoincareMap, Start
-from ._section import Section, section_map
-from ._stroboscopic import Advance, phase_map
+from ._map_of import map_of
+from ._section import Section
+from ._settled import settled
 
 
 UNDECIDED, FAILED = -1, -2
 FEW = 32  # starts, for which a batch is not that of a sweep
-SURE = 0.05  # of `tol`: so far at most from where it tends to is what counts as a solution that has settled
 
 
 @shown
@@ -94,23 +94,6 @@ class _Lanes(eqx.Module):
             return last, jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(rows.y)
 
         return jax.vmap(lane)(*here)
-
-
-def _settled(points: Float[np.ndarray, "iterates n"], tol: float) -> int:
-    """After how many iterates a sequence repeats itself, if what is left of its way is known to be short: it comes
-    nearer by the same factor each time, as far as can be seen. 0 otherwise."""
-    half = len(points) // 2
-    for order in range(1, half // 2 + 1):
-        gaps = np.abs(points[order:] - points[:-order]).max(axis=1)
-        early, late = gaps[-half : -half // 2].max(), gaps[-half // 2 :].max()
-        if late <= 64 * np.finfo(points.dtype).eps * np.abs(points).max():
-            return order
-        if late > tol or late >= early:
-            continue
-        factor = (late / early) ** (order / max(1, half // 2))  # from one time around to the next
-        if late * factor / (1 - factor) < SURE * tol:
-            return order
-    return 0
 
 
 @dataclasses.dataclass
@@ -181,14 +164,10 @@ class _Search:
             shifts = (np.abs(end - np.roll(cycle, shift, axis=0)).max() for shift in range(order))
             if min(shifts) <= self.tol:
                 return k
-        order = _settled(points, self.tol) if self.finds and len(points) >= self.memory else 0
+        order = int(settled(points, self.tol)) if self.finds and len(points) >= self.memory else 0
         if not order:
             return UNDECIDED
-        # Several times around counts as once.
-        around = points[-order:]
-        divisors = (k for k in range(1, order + 1) if order % k == 0)
-        order = next(k for k in divisors if np.abs(around - np.roll(around, k, axis=0)).max() <= self.tol)
-        self.known.append(around[-order:])
+        self.known.append(points[-order:])
         return len(self.known) - 1
 
     def add(self, x: np.ndarray) -> None:
@@ -274,7 +253,7 @@ def basins(
     t0, like, _ = checked_start(system, t0, jax.tree.map(lambda x: jnp.ravel(x)[0], starts), None)
     integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype)
     system = arrays_of(system, t0.dtype)
-    step = _step(system, section, (direction, max_time), interval, (t0, like), integrator)
+    step = map_of(system, section, (direction, max_time), interval, (t0, like), integrator)
     lanes = _Lanes(step, system, t0, like, min(8, max_iterates))
     search = _Search(lanes, float(tol), max_iterates, FEW if np.prod(shape) <= FEW else CHUNK, attractors is None)
     if attractors is not None:
@@ -334,21 +313,3 @@ def _beside_another(label: np.ndarray) -> np.ndarray:
     around = np.pad(label, 1, mode="edge")
     shifted = (around[i : i + rows, j : j + columns] for i in range(3) for j in range(3))
     return np.any([part != label for part in shifted], axis=0)
-
-
-def _step(
-    system: System, section: Any, how: tuple[int, Any], interval: Any, start: tuple[Scalar, Y], integrator: Integrator
-) -> PoincareMap:
-    t0, y0 = start
-    if interval is not None:
-        if system.period is not None or section is not None:
-            raise ValueError("Argument `interval` is for autonomous systems without `section`.")
-        return Advance(integrator, 1, jnp.asarray(interval, t0.dtype))
-    if section is not None:
-        return section_map(system, section, *how, t0, y0, integrator)
-    if system.period is None:
-        raise ValueError(
-            f"`{type(system).__name__}` is autonomous: give a `section` that its periodic orbits cross, or an "
-            "`interval` if its solutions come to rest."
-        )
-    return phase_map(system, 1, integrator)

@@ -1,5 +1,6 @@
 """Brute-force bifurcation diagrams: where solutions settle, for many values of a parameter."""
 
+import os
 from typing import Any
 
 import diffrax as dfx
@@ -16,7 +17,8 @@ from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
 from ..flow._results import outcomes, RESULTS
 from ..orbits._orbit import ravel
-from ..sweeps._sweep import sweep
+from ..sweeps._devices import Devices
+from ..sweeps._long_sweep import sweep_in
 from ..system._parameter import parameter_path, put_parameter
 from ..system._system import arrays_of, System
 from ._iterate import Iterate, PoincareMap
@@ -128,6 +130,8 @@ def brute_force(
     max_steps: int = 4096,
     max_events: int = 256,
     chunk: int | None = None,
+    devices: Devices | None = None,
+    path: str | os.PathLike | None = None,
 ) -> BruteForce:
     """A brute-force bifurcation diagram: for each value of a parameter, the points at which solutions pierce a Poincaré
     section after a transient.
@@ -153,7 +157,9 @@ def brute_force(
         follows a branch to where it ends: with `values` rising and falling it shows hysteresis. `starts` are for the
         first. By default every value has all of them.
     - `solver`, `stepsize_controller`: as for `solve`. `max_steps`, `max_events`: for each point.
-    - `chunk`: how many solutions go together, see `sweep`.
+    - `chunk`, `devices`: how many solutions go together, and on which devices, see `sweep`.
+    - `path`: a folder that keeps what is done, a chunk of solutions at a time, and from which a call that was
+        interrupted goes on; see `Sweep`.
 
     **Returns:** a `BruteForce`. Solutions that fail, or return no more, have a `result` that says why.
 
@@ -172,7 +178,7 @@ def brute_force(
     one = jax.tree.map(lambda x: x[0], starts)
     t0, y0, _ = checked_start(system, t0, one, None)
     integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype)
-    path = parameter_path(system, parameter)
+    place = parameter_path(system, parameter)
     system = arrays_of(system, t0.dtype)
     values = jnp.asarray(values, t0.dtype)
     if values.ndim != 1 or not len(values):
@@ -183,12 +189,12 @@ def brute_force(
         step = section_map(system, section, direction, max_time, t0, y0, integrator)
     starts = jax.tree.map(lambda x: jnp.asarray(x, t0.dtype), starts)
     number = len(jax.tree.leaves(starts)[0])
-    args = (system, path, step, t0, values, transient, keep)
+    args = (system, place, step, t0, values, transient, keep)
     if carry:
-        found = sweep(_Carried(*args), starts, chunk=chunk)
+        found = sweep_in(path, _Carried(*args), starts, chunk=chunk, devices=devices)
         found = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), found)
     else:
         each = jax.tree.map(lambda x: jnp.tile(x, (len(values),) + (1,) * (x.ndim - 1)), starts)
-        found = sweep(_Apart(*args), jnp.repeat(values, number), each, chunk=chunk)
+        found = sweep_in(path, _Apart(*args), jnp.repeat(values, number), each, chunk=chunk, devices=devices)
         found = jax.tree.map(lambda x: x.reshape(len(values), number, *x.shape[1:]), found)
     return BruteForce(parameter, values, *found)

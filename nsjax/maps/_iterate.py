@@ -18,6 +18,7 @@ from .._types import Scalar, Y
 from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, outcomes, raise_if, RESULTS
+from ..flow._solution import Solution
 from ..flow.events._initial_mode import start_mode
 from ..system._checks import check_model
 from ..system._impact import impact
@@ -77,8 +78,22 @@ class PoincareMap(eqx.Module):
         """The system to be solved."""
 
     @abc.abstractmethod
+    def passage(
+        self, system: System, here: tuple[Scalar, Scalar, Y], mode: Any, still: bool = False
+    ) -> tuple[Scalar, Y, RESULTS, Solution]:
+        """To the next iterate after the one at (t, y), of a solution that began at t0: its time, state and result, and
+        the solution on the way there.
+
+        **Arguments:**
+
+        - `here`: t0, t, y.
+        - `still`: whether only the state has derivatives.
+        """
+
     def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
         """The next iterate after the one at (t, y), of a solution that began at t0."""
+        later, y, result, sol = self.passage(system, (t0, t, y), mode)
+        return later, y, sol.mode1, result
 
     @abc.abstractmethod
     def horizon(self, system: System, t: Scalar) -> Scalar:

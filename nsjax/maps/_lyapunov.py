@@ -192,7 +192,7 @@ def _follow(
     return logs, grown, unravel(x), result
 
 
-def _standard_errors(rates: Float[Array, "span exponents"]) -> Float[Array, " exponents"]:
+def standard_errors(rates: Float[Array, "span exponents"]) -> Float[Array, " exponents"]:
     """The largest that blocks of 1, 2, 4, ... intervals give: rates that follow one another are not independent."""
     span, found = len(rates), []
     length = 1
@@ -277,7 +277,7 @@ def lyapunov_spectrum(
     time = step.horizon(system, t0)
     rates = logs / time
     mean = None if grown is None else jnp.mean(grown) / time
-    out = LyapunovSpectrum(jnp.mean(rates, axis=0), _standard_errors(rates), rates, time, mean, y1, result)
+    out = LyapunovSpectrum(jnp.mean(rates, axis=0), standard_errors(rates), rates, time, mean, y1, result)
     return raise_if(~is_okay(result), result, out) if throw else out
 
 

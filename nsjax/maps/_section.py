@@ -16,6 +16,7 @@ from .._numerics._text import positive
 from .._types import Scalar, Y
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
+from ..flow._solution import Solution
 from ..flow._solve import integrate
 from ..flow.events._initial_mode import AT_ONCE
 from ..system._clock import clock
@@ -103,27 +104,34 @@ class _Section(PoincareMap):
         on = (jnp.abs(h) <= at_once * jnp.abs(rate)) & (rate != 0)
         return *others, jnp.where(on, jnp.sign(rate).astype(jnp.int32), side)
 
-    def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
+    def passage(
+        self, system: System, here: tuple[Scalar, Scalar, Y], mode: Any, still: bool = False
+    ) -> tuple[Scalar, Y, RESULTS, Solution]:
+        _, t, y = here
         end = t + self.max_time
-        sol = integrate(system, t, end, y, self.integrator, mode=mode)
+        sol = integrate(system, t, end, y, self.integrator, mode=mode, still=still)
         late = is_okay(sol.result) & ~(sol.t1 < end)
         y1 = sol.y1
         for switch in system.switches:
             if isinstance(switch, impact) and switch.ends:
-                y1 = _onto(switch, system, sol.t1, y1)
-        return sol.t1, y1, sol.mode1, RESULTS.where(late, RESULTS.no_return, sol.result)
+                y1 = _onto(switch, system, sol, y1)
+        return sol.t1, y1, RESULTS.where(late, RESULTS.no_return, sol.result), sol
 
 
-def _onto(switch: AbstractSwitch, system: System, t: Scalar, y: Y) -> Y:
+def _onto(switch: AbstractSwitch, system: System, sol: Solution, y: Y) -> Y:
     """The state after an impact without what rounding has left between it and the surface: where h is compared with
-    nothing but zero, a solution that goes on from there must not begin beyond it."""
+    nothing but zero, a solution that goes on from there must not begin beyond it. (A reset that takes the state away
+    from the surface has not left it there by rounding.)"""
     flat, unravel = jfu.ravel_pytree(y)
-    still, t_still, x = frozen((system, t, flat))
+    last = jax.tree.map(lambda x: x[sol.events.num - 1], sol.events.y_before)
+    still, t_still, x, before = frozen((system, sol.t1, flat, jfu.ravel_pytree(last)[0]))
 
     def gap(x: Array) -> Scalar:
         return ft.reduce(jnp.minimum, switch.components(still, t_still, unravel(x)))
 
     h, normal = jax.value_and_grad(gap)(x)
+    rounding = float(jnp.finfo(x.dtype).eps) ** 0.5 * jnp.max(jnp.abs(x)) * jnp.linalg.norm(normal)
+    h = jnp.where(jnp.abs(h) <= 2 * jnp.abs(gap(before)) + rounding, h, 0)
     return unravel(flat - h * normal / jnp.where(normal @ normal == 0, 1, normal @ normal))
 
 

@@ -5,12 +5,12 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from .._numerics._text import positive
 from .._types import Scalar, Y
 from ..flow._integrator import Integrator
 from ..flow._results import RESULTS
+from ..flow._solution import Solution
 from ..flow._solve import integrate
 from ..system._checks import check_system
 from ..system._system import System
@@ -29,11 +29,14 @@ class Advance(PoincareMap):
     def horizon(self, system: System, t: Scalar) -> Scalar:
         return jnp.asarray(system.period if self.interval is None else self.interval, t.dtype) * self.order
 
-    def once(self, system: System, t: Scalar, t0: Scalar, y: Y, mode: Any) -> tuple[Scalar, Y, Array, RESULTS]:
+    def passage(
+        self, system: System, here: tuple[Scalar, Scalar, Y], mode: Any, still: bool = False
+    ) -> tuple[Scalar, Y, RESULTS, Solution]:
         # Each time from t0, so that time does not lose digits.
+        t0, t, y = here
         period = self.horizon(system, t)
-        sol = integrate(system, t0, t0 + period, y, self.integrator, mode=mode or None)
-        return t + period, sol.y1, sol.mode1, sol.result
+        sol = integrate(system, t0, t0 + period, y, self.integrator, mode=mode or None, still=still)
+        return t + period, sol.y1, sol.result, sol
 
 
 def phase_map(system: System, order: int, integrator: Integrator) -> Advance:

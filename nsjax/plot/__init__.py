@@ -3,6 +3,7 @@ changes no global style. Matplotlib is imported by the first picture, not with n
 
 from .._numerics._text import components as components
 from ..mechanics._sketch import sketch as sketch
+from ._attractor_chart import attractor_chart as attractor_chart
 from ._basins import basins as basins
 from ._branch import bifurcation_diagram as bifurcation_diagram
 from ._eigenvalues import eigenvalue_path as eigenvalue_path

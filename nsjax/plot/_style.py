@@ -39,11 +39,11 @@ def axis_label(labels: Labels, name: Any, default: str | None = None) -> str:
     return (labels or {}).get(name, name if default is None else default)
 
 
-def legend(ax: "Axes") -> None:
+def legend(ax: "Axes", columns: int = 3) -> None:
     """A legend above the axes, where it hides nothing; each label once, as it was drawn first."""
     handles, names = ax.get_legend_handles_labels()
     unique = dict(reversed([*zip(names, handles)]))
     unique = {name: unique[name] for name in dict.fromkeys(names)}
     if unique:
-        place = dict(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize="small", frameon=False)
+        place = dict(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, fontsize="small", frameon=False)
         ax.legend(unique.values(), unique.keys(), **place)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._numerics._compile import eager
+from .._numerics._compile import eager, on_host
 from .._numerics._text import known, positive, shown
 from ._claim import Claims, myself
 from ._dataset import dataset, leaf_names
@@ -21,7 +21,7 @@ from ._lanes import CHUNK, default_chunk, lanes_of
 from ._outcomes import Outcome, outcome_of
 from ._piece import MOST, Piece
 from ._progress import Meter, Progress, Status
-from ._sweep import sweep
+from ._sweep import in_pieces, sweep
 from ._work import Work
 
 
@@ -250,3 +250,23 @@ def sweep_in(
         return sweep(fn, *args, chunk=chunk, devices=devices)
     runs = Sweep(fn, *args, path=path, block=chunk or CHUNK, chunk=chunk, devices=devices).run()
     return jax.tree.map(jnp.asarray, runs.result())
+
+
+def sweep_again(
+    path: str | os.PathLike | None,
+    fn: Callable[..., Any],
+    *args: Any,
+    chunk: int,
+    devices: Devices | None = None,
+) -> Any:
+    """`sweep_in` for a function that is applied again and again, to fewer and fewer lanes: always in chunks of one
+    length, so that all of it is one program. Returns NumPy's arrays."""
+    lanes = lanes_of(args)
+    if path is None:
+        return on_host(in_pieces(fn, lanes, chunk, 1, devices_of(devices)))
+    short = chunk - lanes.number
+    if short > 0:
+        lanes = jax.tree.map(lambda x: np.concatenate([x, *[x[-1:]] * short]), lanes.mapped), lanes.rest
+        args = eqx.combine(*lanes)
+    runs = Sweep(fn, *args, path=path, block=chunk, chunk=chunk, devices=devices).run()
+    return jax.tree.map(lambda x: x[: min(len(x), len(x) - short)], runs.result())

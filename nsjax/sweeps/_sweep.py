@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from .._numerics._compile import eager
 from .._numerics._text import known, positive
 from ._chunks import in_chunks
-from ._devices import DeviceQueue, Devices, devices_of
+from ._devices import Device, DeviceQueue, Devices, devices_of
 from ._lanes import default_chunk, even_chunks, Lanes, lanes_of
 from ._piece import MOST, Piece
 from ._sharded import sharded, spread_over
@@ -85,8 +85,12 @@ def _handed_out(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices
     chunks, chunk = even_chunks(lanes.number, chunk)
     if not lanes.number:
         return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, 1)
-    together = min(MOST, -(-chunks // PIECES))
-    found = found[: -(-chunks // together)]  # a device without a piece needs no program
+    return in_pieces(fn, lanes, chunk, min(MOST, -(-chunks // PIECES)), found)
+
+
+def in_pieces(fn: Callable[..., Any], lanes: Lanes, chunk: int, together: int, found: list[Device]) -> Any:
+    """Pieces of so many chunks `together`, each on the device that is free first."""
+    found = found[: -(-lanes.number // (chunk * together))]  # a device without a piece needs no program
     piece, lanes = Piece(fn, lanes, chunk, together, found), lanes.on_host()
     out = [np.empty((lanes.number, *form.shape), form.dtype) for form in piece.program.forms]
     starts = range(0, lanes.number, piece.size)

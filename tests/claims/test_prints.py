@@ -96,6 +96,11 @@ SPECTRUM = nsjax.maps.LyapunovSpectrum(
     jnp.array([0.06, -jnp.inf]), jnp.array([1e-3, jnp.nan]), jnp.ones((9, 2)), jnp.asarray(3.0), None, STATE, GOOD
 )
 BASINS = nsjax.maps.Basins(np.array([0, 0, -1]), (Motion(*jnp.ones((2, 1))),), np.ones(3, int), ROWS, np.zeros(3, int))
+CHART = nsjax.maps.AttractorChart(
+    ("omega", "e"), (np.array([1.0, 2.0]), np.array([0.5])), np.array([[2], [0]]), np.array([[0], [-1]]),
+    ("wall×2",), np.array([[False], [True]]), np.ones((2, 1)), np.ones((2, 1)), np.ones((2, 1), int), ROWS,
+    np.zeros((2, 1), int),
+)  # fmt: skip
 ITERATE = nsjax.maps.Iterate(jnp.asarray(6.25), STATE, jnp.array([-1, 1]), GOOD)
 REDUCED = nsjax.maps.ReducedIterate(jnp.asarray(0.7), STATE, GOOD)
 TABLE = nsjax.WorkPrecision((Row("Tsit5", 1e-6, 0.1, 1e-7, 2.0, None, ""),), 0.0)
@@ -103,6 +108,7 @@ TABLE = nsjax.WorkPrecision((Row("Tsit5", 1e-6, 0.1, 1e-7, 2.0, None, ""),), 0.0
 # Result, how many lines at most, and what the text begins with and holds.
 CASES = {
     "basins": (BASINS, 3, "basins of 1 attractors, 3 starts", "undecided: 33.33%"),
+    "a chart": (CHART, 4, "attractor chart over omega = 1 to 2, e = 0.5: 2 x 1", "1 chaos, 1 period 2"),
     "Lyapunov exponents": (SPECTRUM, 3, "Lyapunov exponents over 9 intervals of 3: successful", "0.06 ± 0.001"),
     "an orbit": (orbit(), 6, "stable periodic orbit of StickSlip", "multipliers  1+0j, 0.5+0j"),
     "no orbit": (orbit(RESULTS.orbit_not_found), 6, "failed search (orbit_not_found) for a periodic orbit", "residual"),

@@ -482,6 +482,23 @@ def test_brute_force_finds_the_steady_state():
     assert len(traced) == once
 
 
+def test_brute_force_in_a_folder(tmp_path, monkeypatch):
+    """On devices of its own choice, kept and read again, and the same."""
+    starts, values = Motion(jnp.asarray([2.0, -1.0]), jnp.asarray([0.0, 3.0])), jnp.linspace(0.5, 1.5, 3)
+    for carry in (False, True):
+        args, options = (
+            (Oscillator(f=1.0, forced=True), "omega", values, starts),
+            dict(transient=8, keep=4, carry=carry),
+        )
+        plain = brute_force(*args, **options)
+        kept = brute_force(*args, path=tmp_path / str(carry), devices=1, **options)
+        with monkeypatch.context() as patch:
+            patch.setattr("nsjax.sweeps._piece.Piece.run", lambda *_: pytest.fail("computed once more"))
+            again = brute_force(*args, path=tmp_path / str(carry), **options)
+        np.testing.assert_allclose(flat(kept.ys), flat(plain.ys), atol=1e-13)
+        np.testing.assert_array_equal(flat(kept.ys), flat(again.ys))
+
+
 def test_what_has_not_settled_gets_no_period():
     """Pitfall 46: after a fixed time, 40 periods, a motion that decays by 6 % a period is on its way still. It is not
     taken for the attractor that is near, but left undecided."""

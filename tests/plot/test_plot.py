@@ -1,5 +1,6 @@
 """Pictures: what is drawn is the solution, cut at its events; nothing global changes."""
 
+import dataclasses
 import functools
 import types
 from typing import NamedTuple
@@ -365,3 +366,45 @@ def test_bifurcation_diagram_with_words_and_lines_of_ones_own():
     assert {line.get_label() for line in lines} == {"stable equilibrium", "unstable equilibrium"}
     assert {(line.get_color(), line.get_linewidth()) for line in lines} == {("C1", 0.7)}
     assert not plot.bifurcation_diagram(branch, names=False).texts
+
+
+# Charts of attractors.
+
+
+def chart():
+    """Two columns of three: period 1, period 2, chaos; undecided, failed, a long itinerary."""
+    periods, classes = np.array([[1, 2, 0], [0, -1, 4]]), np.array([[0, 1, -1], [-1, -1, -1]])
+    chaotic, rates = np.array([[0, 0, 1], [0, 0, 0]], bool), np.array([[-0.3, -np.inf, 0.1], [0.0, np.nan, -0.1]])
+    values = np.array([1.0, 2.0]), np.array([0.1, 0.2, 0.3])
+    zero = np.zeros((2, 3), int)
+    words = ("belt0 belt-", "belt+")
+    return nsjax.maps.AttractorChart(
+        ("omega", "a"), values, periods, classes, words, chaotic, rates, rates, zero, (), zero
+    )
+
+
+def test_attractor_chart():
+    """The colours of the cells are those of the legend, chaos is dark and what is not known white."""
+    found = chart()
+    for by, names in (
+        ("period", ["period 1", "period 2", "period 4", "chaos", "undecided", "failed"]),
+        ("itinerary", ["belt0 belt-", "belt+", "others", "chaos", "undecided", "failed"]),
+    ):
+        ax = plot.attractor_chart(found, by, labels={"omega": "ω [rad/s]"})
+        assert (ax.get_xlabel(), ax.get_ylabel()) == ("ω [rad/s]", "a") and legend_names(ax) == names
+        ax.figure.canvas.draw()
+        (mesh,) = ax.collections
+        cells = mesh.get_facecolors().reshape(3, 2, 4)  # rows go along the second parameter
+        colour = {line.get_label(): matplotlib.colors.to_rgba(line.get_markerfacecolor()) for line in ax.get_lines()}
+        want = [[names[0], "undecided"], [names[1], "failed"], ["chaos", names[2]]]
+        np.testing.assert_allclose(cells, [[colour[name] for name in row] for row in want], atol=1e-6)
+        assert len({tuple(c) for c in colour.values()}) == 6
+    ends = [f"belt0 {'belt- belt+ ' * 9}{end}" for end in ("belt0", "belt-", "belt- belt0")]
+    many = dataclasses.replace(found, itineraries=tuple(ends), classes=np.array([[0, 1, -1], [-1, -1, 2]]))
+    assert len(legend_names(plot.attractor_chart(many, "itinerary"))) == 6
+    ax = plot.attractor_chart(found, "exponent", labels={"exponent": "λ₁ [1/s]"})
+    (mesh,) = ax.collections
+    low, high = mesh.get_clim()
+    assert low == -high < 0 and mesh.get_array().mask.sum() == 1 and ax.figure.axes[1].get_ylabel() == "λ₁ [1/s]"
+    with pytest.raises(ValueError, match="`by` must be"):
+        plot.attractor_chart(found, "phase")
