@@ -14,25 +14,39 @@ import numpy as np
 
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 # Each entry of the result depends on the same entry of the operands.
-_ELEMENTWISE = frozenset(
+ELEMENTWISE = frozenset(
     "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy cos cosh "
     "div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le lgamma digamma log log1p logistic lt "
     "max min mul ne neg nextafter not or pow real_type reduce_precision rem round rsqrt select_n sign sin sinh sqrt "
     "square stop_gradient sub tan tanh xor".split()
 )
+
+
+def _padded(p: dict, m: np.ndarray, filler: np.ndarray) -> np.ndarray:
+    """`lax.pad` of marks, or of what else an array may hold."""
+    places = [lo + (inner + 1) * np.arange(n) for n, (lo, _, inner) in zip(m.shape, p["padding_config"])]
+    shape = [lo + hi + n + inner * max(n - 1, 0) for n, (lo, hi, inner) in zip(m.shape, p["padding_config"])]
+    out = np.full(shape, filler[()], m.dtype)
+    kept = [(at >= 0) & (at < n) for at, n in zip(places, shape)]
+    out[np.ix_(*(at[k] for at, k in zip(places, kept)))] = m[np.ix_(*kept)]
+    return out
+
+
 # They jump. So does what makes integers or truth values of real numbers (comparisons, conversions, `argmax`), and what
 # a loop does is not looked at. (What only asks whether a number is finite does not count.)
 _JUMPING = frozenset("ceil cond floor nextafter rem round scan sign while".split())
 # Entries are moved, repeated or summed: what that makes of a mask (parameters `p` of the primitive, operands `m`).
-_MOVING: dict[str, Callable[..., np.ndarray]] = {
+MOVING: dict[str, Callable[..., Any]] = {
     "broadcast_in_dim": lambda p, m: np.broadcast_to(
         np.expand_dims(m, tuple(i for i in range(len(p["shape"])) if i not in p["broadcast_dimensions"])), p["shape"]
     ),
     "concatenate": lambda p, *ms: np.concatenate(ms, p["dimension"]),
+    "pad": _padded,
     "reduce_sum": lambda p, m: m.any(p["axes"]),
     "reshape": lambda p, m: m.reshape(p["new_sizes"]),
     "rev": lambda p, m: np.flip(m, p["dimensions"]),
     "slice": lambda p, m: m[tuple(map(slice, p["start_indices"], p["limit_indices"], p["strides"] or [1] * m.ndim))],
+    "split": lambda p, m: np.split(m, np.cumsum(p["sizes"])[:-1], p["axis"]),
     "squeeze": lambda p, m: m.squeeze(p["dimensions"]),
     "stack": lambda p, *ms: np.stack(ms, p["axis"]),
     "transpose": lambda p, m: m.transpose(p["permutation"]),
@@ -60,10 +74,11 @@ def _masks(jaxpr: Any, inputs: list[np.ndarray], jumps: list[str] | None = None)
         inner = [p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr)]
         if not any(m.any() for m in have):
             out = [np.zeros(shape(v), bool) for v in e.outvars]
-        elif name in _ELEMENTWISE:
+        elif name in ELEMENTWISE:
             out = [np.any(np.broadcast_arrays(*have), axis=0)]
-        elif name in _MOVING:
-            out = [_MOVING[name](e.params, *have)]
+        elif name in MOVING:
+            moved = MOVING[name](e.params, *have)
+            out = moved if isinstance(moved, list) else [moved]
         elif name == "dot_general" and not e.params["dimension_numbers"][1][0]:
             left, right = (m.any(tuple(axes)) for m, axes in zip(have, e.params["dimension_numbers"][0]))
             out = [np.logical_or.outer(left, right)]

@@ -24,6 +24,19 @@ def row(numbers: Sequence[Any]) -> Any:
     return jnp.stack(list(numbers)) if len(numbers) > WRITTEN_OUT else list(numbers)
 
 
+def coloured(touches: Bool[np.ndarray, "rows columns"]) -> list[list[int]]:
+    """Columns of a sparse matrix that share no row, together: a derivative in the sum of their directions has the
+    entries of all of them."""
+    colours: list[list[int]] = []
+    for j in range(touches.shape[1]):
+        mine = next((c for c in colours if not (touches[:, [j]] & touches[:, c]).any()), None)
+        if mine is None:
+            colours.append([j])
+        else:
+            mine.append(j)
+    return colours
+
+
 def product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
     """a b, for small matrices written out: of batches of five rows that takes a sixth of the time of XLA's product."""
     if a.shape[1] > 8:

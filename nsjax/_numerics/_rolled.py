@@ -40,10 +40,10 @@ def rolled(
         return jax.tree.leaves(of(written_out, *inputs))
 
     inputs = [*inner.consts, *flat]
-    return _bound(inputs, ft.partial(of, loop), lanes, (True,) * len(inputs))
+    return bound(inputs, ft.partial(of, loop), lanes, (True,) * len(inputs))
 
 
-def _bound(inputs: list[Any], loop: Callable[..., Any], written_out: Flat, own: tuple[bool, ...]) -> Any:
+def bound(inputs: list[Any], loop: Callable[..., Any], written_out: Flat, own: tuple[bool, ...]) -> Any:
     """`own` says which inputs are arguments, and no tangents."""
     jaxpr, form = jax.make_jaxpr(loop, return_shape=True)(*inputs)
     results = rolled_p.bind(*inputs, jaxpr=jaxpr, written_out=written_out, own=own)
@@ -65,7 +65,7 @@ def _batch(
         results = mapped(written_out, size, batched, wide)(*front)
     else:
         loop, other = (mapped(fn, size, batched, wide) for fn in (jex.jaxpr_as_fun(jaxpr), written_out))
-        results = _bound(front, loop, other, own)
+        results = bound(front, loop, other, own)
     return results, [0 if w else None for w in wide]
 
 
@@ -75,7 +75,7 @@ def _jvp(
     smooth = moving(tangents)
     kept = [i for i, a in enumerate(jaxpr.out_avals) if jnp.issubdtype(a.dtype, jnp.inexact)]
     loop, other = (pushed_forward(fn, len(inputs), smooth, kept) for fn in (jex.jaxpr_as_fun(jaxpr), written_out))
-    results = _bound([*inputs, *[tangents[i] for i in smooth]], loop, other, own + (False,) * len(smooth))
+    results = bound([*inputs, *[tangents[i] for i in smooth]], loop, other, own + (False,) * len(smooth))
     count = len(jaxpr.out_avals)
     return results[:count], with_zeros(results[:count], kept, results[count:])
 

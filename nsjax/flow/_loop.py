@@ -85,6 +85,7 @@ class Flow(eqx.Module):
     affine: tuple[bool, ...] = eqx.field(static=True)  # whether each guard is affine in (t, y)
     jumpy: tuple[bool, ...] = eqx.field(static=True)  # whether each guard holds an operation that may jump
     reverse: bool = eqx.field(static=True)  # whether the loop is to be transposed
+    seen: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # of many guards what they take notice of, or empty
 
     @property
     def tolerance(self) -> tuple[Any, Any]:
@@ -104,7 +105,7 @@ class Flow(eqx.Module):
         *first, last = once(self.stepper.scaled(model, step.polynomials))
         polynomials = [*first, jnp.where(model.stacked(touches, False), jnp.minimum(last, 0), last)]
         step = step._replace(polynomials=polynomials, noise=model.stacked(step.noise, 0.0))
-        return transition(model, self.stepper, self.tolerance, self.record, self.t0, step)
+        return transition(model, self.stepper, self.tolerance, self.record, self.t0, self.seen, step)
 
     def attempt(self, c: Carry) -> _Attempt:
         """A step of the solver, its error against the tolerance, and whether a guard may have a root on it."""

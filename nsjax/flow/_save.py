@@ -118,7 +118,7 @@ class Saved(eqx.Module):
         times = 0 if request.ts is None else len(request.ts)
         steps = (max_steps + 2 * max_events) // request.steps if request.steps else 0
         size = int(request.t0) + times + int(request.t1) + steps
-        out = jax.eval_shape(lambda: request.fn(t, y, model.system))
+        out = jax.eval_shape(lambda: request.fn(t, y, model.system.owner))
         self.ts = jnp.full(size, jnp.inf, t.dtype)
         self.ys = jax.tree.map(
             lambda x: jnp.full((size, *x.shape), jnp.inf if jnp.issubdtype(x.dtype, jnp.inexact) else 0, x.dtype), out
@@ -132,7 +132,7 @@ class Saved(eqx.Module):
     def write(self, when: Any, t: Scalar, y: Y, mode: tuple, model: SwitchedSystem) -> "Saved":
         mode_row = jnp.stack(mode) if mode else jnp.zeros(0, jnp.int32)
         t = t * model.direction
-        row = (t, self.request.fn(t, y, model.system), mode_row)
+        row = (t, self.request.fn(t, y, model.system.owner), mode_row)
         new = _put((self.ts, self.ys, self.modes), self.count, row, when)
         return eqx.tree_at(
             lambda s: (s.ts, s.ys, s.modes, s.count), self, (*new, self.count + jnp.asarray(when, jnp.int32))

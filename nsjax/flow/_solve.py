@@ -16,6 +16,8 @@ from jaxtyping import Array, Int
 from .._numerics._autodiff import dense_jacobian, forward_only, frozen
 from .._numerics._compile import interactive
 from .._numerics._jaxpr import is_affine, may_jump
+from .._numerics._linalg import WRITTEN_OUT
+from .._numerics._merge import merged
 from .._numerics._text import known, suggesting
 from .._types import Scalar, StateT, Y
 from ..system._checks import check_model, closing_contacts
@@ -32,6 +34,7 @@ from ._solution import Events, Solution
 from .affine._exact import exactly
 from .affine._plan import allows
 from .events._initial_mode import start_mode
+from .events._locate import seen_numbers
 from .steppers._exponential import AbstractExponential, Affine, ExponentialStepper
 from .steppers._stepper import RungeKutta, Stepper
 from .steppers._taylor import Taylor, TaylorStepper
@@ -63,6 +66,8 @@ def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> So
             "`adjoint=diffrax.DirectAdjoint()` (up to some tens of parameters and states) or "
             "`adjoint=diffrax.RecursiveCheckpointAdjoint()` (more). Or use `jax.jacfwd`.",
         )
+        if len(system.switches) > WRITTEN_OUT:
+            run = merged(run)
     return run(system, t0, t1, y0)
 
 
@@ -70,7 +75,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     direction = jnp.where(t1 >= t0, 1, -1).astype(t0.dtype)
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
-    model = SwitchedSystem(system, direction, start, y0).at(start)
+    model = SwitchedSystem(system.assembled(), direction, start, y0).at(start)
     state, forked, result = start_mode(model, start, y0, options.given, frozen(stop - start))
     stepper = _stepper(options.integrator).made_for(model, state, start, y0)
     y0 = model.project(start, y0, state)  # a change of y0 off the surface that holds it changes nothing
@@ -121,6 +126,7 @@ def _flow(
         affine=affine,
         jumpy=tuple(not affine[i] and may_jump(ft.partial(origin, i), (t, y)) for i in slots),
         reverse=isinstance(integrator.adjoint, dfx.RecursiveCheckpointAdjoint),
+        seen=seen_numbers(model, t, y, state) if len(model.switches) > WRITTEN_OUT else (),
     )
 
 
@@ -209,7 +215,7 @@ def _solution(flow: Flow, c: Carry, t0: Scalar, first: ModeState, end_wanted: bo
     if end_wanted:
         saved = saved.write(True, t_end, y1, c.state.mode, model)
     return Solution(
-        system=model.system,
+        system=model.system.owner,
         t0=t0,
         t1=t_end * model.direction,
         mode0=_row(first.mode),

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._numerics._linalg import Row, WRITTEN_OUT
+from .._numerics._linalg import coloured, Row, WRITTEN_OUT
 
 
 Block = tuple[int, ...]
@@ -33,14 +33,7 @@ class Coupling(NamedTuple):
         solution of their block looks at one by one."""
         m = len(touches)
         touches = touches | np.eye(m, dtype=bool)
-        colours: list[list[int]] = []
-        for j in range(m):
-            apart = (c for c in colours if m > WRITTEN_OUT and not (touches[:, [j]] & touches[:, c]).any())
-            mine = next(apart, None)
-            if mine is None:
-                colours.append([j])
-            else:
-                mine.append(j)
+        colours = coloured(touches) if m > WRITTEN_OUT else [[j] for j in range(m)]
         linked = touches | touches.T
         for _ in range(m.bit_length()):  # twice as far each time
             linked = linked @ linked

@@ -104,6 +104,15 @@ class System(eqx.Module):
         of a parameter, the law, whether it holds, and the value."""
         return []
 
+    def assembled(self) -> "System":
+        """The same, put together once to be evaluated many times: by default the system itself."""
+        return self
+
+    @property
+    def owner(self) -> "System":
+        """The system of the user, of one that is `assembled`."""
+        return self
+
     def values(self, s: tuple[Any, ...]) -> SwitchValues:
         """The argument `s` of `vector_field` from a tuple of values in the order of `switches`."""
         return SwitchValues(type(self).__name__, dict(zip([k.name for k in self.switches], s)))

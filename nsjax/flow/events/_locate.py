@@ -13,6 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._numerics._autodiff import frozen
 from ..._numerics._barrier import once
 from ..._numerics._bernstein import at, deflate, falls, first_root, largest
+from ..._numerics._jaxpr import dependence
+from ..._numerics._linalg import coloured
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
@@ -153,24 +155,57 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
     return Located(met, te, y_end, slot, part, missed)
 
 
+def seen_numbers(model: SwitchedSystem, t: Scalar, y: Y, state: ModeState) -> tuple[tuple[int, ...], ...]:
+    """`[slot][colour]`: the number of the state of which a guard takes notice, whatever the state, in the sum of the
+    directions of a colour; or -1."""
+    flat, unravel = jfu.ravel_pytree(y)
+    rows = model.guards(t, y, state)
+    touches = dependence(lambda x: [g for row in model.guards(t, unravel(x), state) for g in row], flat)
+    owner = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
+    touches = np.stack([touches[owner == i].any(axis=0) for i in range(len(rows))])
+    found = np.full((len(rows), len(colours := coloured(touches))), -1)
+    for c, columns in enumerate(colours):
+        for j in columns:
+            found[touches[:, j], c] = j
+    return tuple(map(tuple, found.tolist()))
+
+
 def transversality(
-    model: SwitchedSystem, t: Scalar, y: Y, state: ModeState, part: Int[Array, " slots"], tolerance: Any
+    model: SwitchedSystem,
+    t: Scalar,
+    y: Y,
+    state: ModeState,
+    part: Int[Array, " slots"],
+    tolerance: Any,
+    seen: tuple[tuple[int, ...], ...],
 ) -> tuple[Float[Array, " slots"], Float[Array, " slots"]]:
     """Of each guard the cosine between the trajectory and the normal of its surface, in time and state; and what an
-    error of the state within the tolerance (relative, absolute) makes of it."""
+    error of the state within the tolerance (relative, absolute) makes of it. `seen`: `seen_numbers` of a model with
+    many switches, else empty."""
     model, t, y = frozen((model, t, y))
     flat, unravel = jfu.ravel_pytree(y)
 
     def guards(t: Scalar, x: Array) -> Float[Array, " slots"]:
         return model.stacked(model.guards(t, unravel(x), state), -1.0)[np.arange(len(model.slots)), part]
 
-    h_t, n = jax.jacfwd(guards, argnums=(0, 1))(t, flat)
     rtol, atol = tolerance
-    f = jfu.ravel_pytree(model.flow(t, y, state))[0]
-    return jax.vmap(cosine, (0, 0, None))(h_t, n, f), jnp.abs(n) @ (atol + rtol * jnp.abs(flat))
+    f, error = jfu.ravel_pytree(model.flow(t, y, state))[0], atol + rtol * jnp.abs(flat)
+    if not seen:
+        h_t, n = jax.jacfwd(guards, argnums=(0, 1))(t, flat)
+        return jax.vmap(cosine, (0, 0, None, None))(h_t, n, f, f @ f), jnp.abs(n) @ error
+    table = np.array(seen)
+    number = np.arange(len(flat))
+    seeds = jnp.asarray([np.isin(number, column) for column in table.T], flat.dtype)
+
+    def moved(dt: Scalar, dx: Array) -> Float[Array, " slots"]:
+        return jax.jvp(guards, (t, flat), (dt, dx))[1]
+
+    h_t, n = moved(jnp.ones_like(t), jnp.zeros_like(flat)), jax.vmap(moved, (None, 0), 1)(jnp.zeros_like(t), seeds)
+    n, near = jnp.where(table < 0, 0, n), jnp.maximum(table, 0)
+    return jax.vmap(cosine, (0, 0, 0, None))(h_t, n, f[near], f @ f), jnp.sum(jnp.abs(n) * error[near], axis=1)
 
 
-def cosine(h_t: Scalar, n: Float[Array, " n"], f: Float[Array, " n"]) -> Scalar:
-    """Between the trajectory and the normal (h_t, n) of a surface."""
-    size = (n @ n + h_t**2) * (f @ f + jnp.where(h_t == 0, 0, 1))
+def cosine(h_t: Scalar, n: Float[Array, " n"], f: Float[Array, " n"], speed: Scalar) -> Scalar:
+    """Between the trajectory and the normal (h_t, n) of a surface; `speed` is |f|², also of what n has no part in."""
+    size = (n @ n + h_t**2) * (speed + jnp.where(h_t == 0, 0, 1))
     return jnp.abs(n @ f + h_t) / jnp.sqrt(size)

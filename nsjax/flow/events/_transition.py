@@ -49,10 +49,11 @@ def transition(
     tolerance: tuple[Any, Any],
     record: Callable[[Any], Any] | None,
     begin: Scalar,
+    seen: tuple[tuple[int, ...], ...],
     step: Interval,
 ) -> Transition:
     """Locates the earliest event of a step, of a solution that sets out at time `begin`, and makes the transition.
-    `record`: what dense output is made of, if any; it may be without derivatives."""
+    `record`: what dense output is made of, if any; it may be without derivatives. `seen`: see `transversality`."""
     event = _Event(model, begin, step, locate(model, stepper, step))
     event.fire()
     event.jump()
@@ -75,7 +76,7 @@ def transition(
             news = news | event.fired[k]
 
     slot, part = event.slot, event.part
-    cosines, slack = transversality(model, t, event.before, step.state, part, tolerance)
+    cosines, slack = transversality(model, t, event.before, step.state, part, tolerance, seen)
     cosine, missed = cosines[slot], event.missed
     if event.ticks is not None:
         cosine = jnp.where(event.ticks, 1, cosine)

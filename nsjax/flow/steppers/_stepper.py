@@ -300,15 +300,17 @@ class RungeKutta(Stepper):
                 )
             else:
                 rows = curved(model, state, t, y, step)
-            for i, values in zip(which, rows):
+            matrix = jnp.asarray(to_bernstein(n), t.dtype)
+            coefficients = matrix @ jnp.stack([jnp.stack(values) for values in rows], axis=1)
+            for row, (i, values) in enumerate(zip(which, rows)):
                 # (Not by `jnp.max` of an array: XLA's code for that takes as long as all stages of a step.)
-                last = [sum(float(w) * v for w, v in zip(row, values)) for row in to_chebyshev(n)[-2:]]
+                last = [sum(float(w) * v for w, v in zip(weights, values)) for weights in to_chebyshev(n)[-2:]]
                 tail, size = (ft.reduce(jnp.maximum, map(jnp.abs, x)) for x in (last, values))
                 # Shortly after a double root or a lift-off all of it is rounding, which a shorter step would not mend.
                 noise[i].append(jnp.abs(near[i][len(out[i])] - values[0]))
                 rough = once(tail - unresolved(t.dtype) * size - noise[i][-1])
                 resolved = resolved & ~(rough > 0)
-                out[i].append(list(jnp.asarray(to_bernstein(n), t.dtype) @ jnp.stack(values)))
+                out[i].append(list(coefficients[:, row]))
         return dict(guards=out, noise=with_multipliers(model, noise), resolved=resolved)
 
 
