@@ -19,7 +19,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 
-from ._graph import Graph, Handlers, MANY, Node, Packing, Value
+from ._graph import Graph, Handlers, Node, Packing, Value
 from ._lane_cond import compact_cond
 from ._rolled import bound
 
@@ -175,14 +175,15 @@ class _Step(NamedTuple):
     work: Callable[..., Any]
 
 
-def _order(wanted: Wanted) -> tuple[int, int]:
-    """Later ones need earlier ones; of those at one place arrays that are made of others need these, longer ones
-    shorter ones, all of them single numbers, and these the arrays of which they are elements."""
+def _order(wanted: Wanted) -> tuple[int, int, int]:
+    """What needs others comes after them: by place; at one place results, their elements, rows of arrays, of numbers,
+    of arrays that are made of numbers, and such arrays; of rows the longer ones after the shorter ones."""
     if isinstance(wanted, tuple):
-        return max(v.place for v in wanted), 1 + len(wanted)
+        single, made = wanted[0].shape == (), any(v.entries is not None for v in wanted)
+        return max(v.place for v in wanted), 4 if made else 3 if single else 2, len(wanted)
     if isinstance(wanted, Node) or (wanted.base is None and wanted.entries is None):
-        return wanted.place, 0
-    return wanted.place, 1 if wanted.base is not None else 2 + MANY
+        return wanted.place, 0, 0
+    return wanted.place, 1 if wanted.base is not None else 5, 0
 
 
 def _planned(wanted: Wanted) -> _Step:
@@ -232,11 +233,11 @@ def _side_by_side(members: tuple[Value, ...]) -> _Step:
     """How values of one shape become the rows of an array: by one operation on arrays, if they can."""
     first, count = members[0], len(members)
     shape = first.shape
-    if all(v is first for v in members):
-        return _Step([first], lambda x: jnp.broadcast_to(x, (count, *shape)))
     if any(v.entries is not None for v in members):
         flat = [x for v in members for x in np.ravel(v.numbers())]  # pyright: ignore[reportArgumentType, reportCallIssue]
         return _Step([tuple(flat)], lambda x: jnp.reshape(x, (count, *shape)))
+    if all(v is first for v in members):
+        return _Step([first], lambda x: jnp.broadcast_to(x, (count, *shape)))
     different = {id(v): v for v in members}
     if len(different) < count:
         places = {key: i for i, key in enumerate(different)}
@@ -305,7 +306,7 @@ def _worked_out(graph: Graph, results: list[Value], xs: list[Any]) -> list[Any]:
     """The results of a program for these arguments."""
     done: dict[Any, Any] = {id(v): x for v, x in zip(graph.arguments, xs, strict=True)}
     wanted: dict[Any, Wanted] = {}
-    heap: list[tuple[int, int, int]] = []
+    heap: list[tuple[int, ...]] = []
     keys: list[Any] = []
 
     def name(what: Wanted) -> Any:
@@ -323,15 +324,14 @@ def _worked_out(graph: Graph, results: list[Value], xs: list[Any]) -> list[Any]:
             done[key] = np.asarray(what.const, what.dtype) if number else what.const
             return
         wanted[key] = what
-        place, rank = _order(what)
-        heapq.heappush(heap, (-place, -rank, len(keys)))
+        heapq.heappush(heap, (*(-x for x in _order(what)), len(keys)))
         keys.append(key)
 
     for what in [*results, *(node for node in graph.nodes if node.effects)]:
         want(what)
     steps = []
     while heap:
-        key = keys[heapq.heappop(heap)[2]]
+        key = keys[heapq.heappop(heap)[-1]]
         step = _planned(wanted[key])
         steps.append((key, step))
         for need in step.needs:
