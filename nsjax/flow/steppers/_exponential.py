@@ -267,7 +267,7 @@ class ExponentialStepper(Stepper):
 
     def made_for(self, model: SwitchedSystem, state: ModeState, t: Scalar, y: Y) -> "ExponentialStepper":
         s = model.signs(t, state)
-        _check_affine(lambda t, y: model.field(t, y, s), t, y, f"`{type(model.system).__name__}`")
+        _check_affine(lambda t, y: model.field(t, y, s), t, y, f"`{type(model.system.owner).__name__}`")
         slides = all(affine_parts(lambda t, y: model.flow(t, y, state), t, y))
         return ExponentialStepper(self.solver, slides)
 
