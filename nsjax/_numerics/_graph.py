@@ -208,6 +208,8 @@ def _moved(node: Node, params: Mapping[str, Any]) -> list[Value] | None:
     if any(part is None for part in parts):
         return None
     moved = MOVING[node.name](params, *parts)
+    out: list[Value] = []
     for v, entries in zip(node.outs, moved if isinstance(moved, list) else [moved], strict=True):
         v.entries = np.asarray(entries, object)
-    return [v.entries[()] if v.entries is not None and v.shape == () else v for v in node.outs]
+        out.append(v.entries[()] if v.shape == () else v)
+    return out

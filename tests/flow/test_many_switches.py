@@ -1,0 +1,102 @@
+"""More than three switches, whose operations are merged: blocks that do not touch each other move as each alone does."""
+
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nsjax
+from nsjax import gallery
+from nsjax.gallery import Motion, thesis
+
+
+N = 4
+STARTS = np.stack([2 * np.sin(1.0 + np.arange(N)), np.cos(3.0 * np.arange(N))])
+TS = jnp.linspace(0.0, 9.0, 19)
+TIGHT = dict(stepsize_controller=diffrax.PIDController(rtol=1e-11, atol=1e-11))
+
+
+class State(NamedTuple):
+    x: jax.Array
+    v: jax.Array
+
+
+class Blocks(nsjax.System):
+    """Blocks on one belt, each on a spring of its own, after (3.33)."""
+
+    v_dr: float = 0.2
+    n: int = N
+
+    @property
+    def switches(self):
+        def contact(i):
+            held = nsjax.sgn(lambda self, t, y: y.v[i] - self.v_dr, name=f"belt{i}")
+            return held.breakaway(lambda self: 2.0)
+
+        return tuple(contact(i) for i in range(self.n))
+
+    def vector_field(self, t, y, s):
+        return State(y.v, -y.x - jnp.stack([s[f"belt{i}"] for i in range(self.n)]))
+
+
+def alone(v_dr, x, v):
+    sol = nsjax.solve(thesis("3.4", v_dr=v_dr), 0.0, 9.0, Motion(x, v), saveat=diffrax.SaveAt(ts=TS), **TIGHT)
+    return sol.ys.x, sol.events.t, sol.events.num
+
+
+def events_of(times, num):
+    return np.asarray(times)[: int(num)]
+
+
+@pytest.fixture(scope="module")
+def singles():
+    """x of each at `TS`, its derivative by the belt's velocity, and all events."""
+    each = jax.jit(jax.vmap(alone, (None, 0, 0)))
+    xs, times, num = each(0.2, *STARTS)
+    slope = jax.jit(jax.jacfwd(lambda v: each(v, *STARTS)[0]))(0.2)
+    return xs, slope, np.sort(np.concatenate([events_of(t, n) for t, n in zip(times, num)]))
+
+
+def check(singles, of_v, xs):
+    want, slope, times = singles
+    (found, (events, num)), moved = jax.jit(lambda v: (of_v(v), jax.jacfwd(lambda v: of_v(v)[0])(v)))(0.2)
+    np.testing.assert_allclose(xs(found), want, atol=1e-8)
+    np.testing.assert_allclose(events_of(events, num), times, atol=1e-8)
+    np.testing.assert_allclose(xs(moved), slope, atol=1e-6)
+
+
+def test_as_each_alone(singles):
+    def of_v(v):
+        sol = nsjax.solve(Blocks(v), 0.0, 9.0, State(*STARTS), saveat=diffrax.SaveAt(ts=TS), **TIGHT)
+        return sol.ys.x, (sol.events.t, sol.events.num)
+
+    check(singles, of_v, lambda x: x.T)
+
+
+@pytest.mark.slow
+def test_a_scene_as_each_alone(singles):
+    names = [f"x{i + 1}" for i in range(N)]
+    begin = gallery.BlockChain(n=N).state(*(dict(zip(names, row)) for row in STARTS))
+
+    def of_v(v):
+        chain = gallery.BlockChain(n=N, k_c=0.0, v_dr=v)
+        sol = nsjax.solve(chain, 0.0, 9.0, begin, saveat=diffrax.SaveAt(ts=TS), **TIGHT)
+        assert isinstance(sol.system, gallery.BlockChain)
+        return sol.ys.q, (sol.events.t, sol.events.num)
+
+    check(singles, of_v, lambda q: jnp.stack(q))
+
+
+@pytest.mark.slow
+def test_lanes_and_second_derivatives():
+    def energy(v):
+        y = nsjax.solve(Blocks(v), 0.0, 4.0, State(*STARTS), throw=False, **TIGHT).y1
+        return jnp.sum(y.x**2 + y.v**2)
+
+    vs, h = jnp.asarray([0.2, 0.35]), 1e-4
+    slopes = jax.jit(jax.vmap(jax.jacfwd(energy)))
+    bends = jax.jit(jax.vmap(jax.jacfwd(jax.jacfwd(energy))))(vs)
+    np.testing.assert_allclose(bends, (slopes(vs + h) - slopes(vs - h)) / (2 * h), rtol=1e-4)
