@@ -11,11 +11,6 @@ from ._scene import Scene
 from ._state import State
 
 
-def _of_scene(scene: Scene) -> tuple[AbstractSwitch, ...]:
-    """The switches of a system that has the scene as its `scene`."""
-    return tuple(within(k, ("scene",), k.name) for k in scene.switches)
-
-
 class SceneModel(System):
     """A system whose parameters are fields of its own, and which is a scene for each of their values: where one number
     enters several effects, or effects are the same many times.
@@ -42,7 +37,7 @@ class SceneModel(System):
 
     @property
     def switches(self) -> tuple[AbstractSwitch, ...]:
-        return _of_scene(self.scene)
+        return tuple(within(k, ("scene",), k.name) for k in self.scene.switches)
 
     @property
     def period(self) -> Any:
@@ -63,27 +58,16 @@ class SceneModel(System):
         return str(self.scene)
 
 
-class _Assembled(System):
+class _Assembled(SceneModel):
     """A scene model with its scene, which is not made anew for each of its switches wherever one of them is asked."""
 
     model: SceneModel
-    scene: Scene
+    built: Scene
 
     @property
     def owner(self) -> System:
         return self.model
 
-    def vector_field(self, t: Scalar, y: State, s: SwitchValues) -> State:
-        return self.scene.vector_field(t, y, s)
-
     @property
-    def switches(self) -> tuple[AbstractSwitch, ...]:
-        return _of_scene(self.scene)
-
-    @property
-    def period(self) -> Any:
-        return self.scene.period
-
-    @property
-    def laws(self) -> list[tuple[str, str, Any, Any]]:
-        return self.scene.laws
+    def scene(self) -> Scene:
+        return self.built
