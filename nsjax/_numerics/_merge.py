@@ -4,7 +4,7 @@ A model of fifty blocks has fifty switches, each with its guards, its value, its
 one switch, in a loop of Python, and make a program of as many small operations, each of which costs XLA a kernel and
 every run the start of that kernel. Here such a program is read as a graph, and operations of one kind at one depth,
 whose results meet in an array, become one operation on arrays. What loops and conditionals are handed number by number
-is handed over as arrays too. So a program hardly grows with the number of switches; the numbers stay the same, but for
+is handed over as arrays too. So a program grows little with the number of switches; the numbers stay the same, but for
 the order in which long sums are taken.
 """
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import equations_of
 
 import nsjax
 from nsjax import gallery
@@ -100,3 +101,18 @@ def test_lanes_and_second_derivatives():
     slopes = jax.jit(jax.vmap(jax.jacfwd(energy)))
     bends = jax.jit(jax.vmap(jax.jacfwd(jax.jacfwd(energy))))(vs)
     np.testing.assert_allclose(bends, (slopes(vs + h) - slopes(vs - h)) / (2 * h), rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_programs_grow_little():
+    """Twice as many switches make a third more of a program, derivatives included; one by one they made it twice as
+    large."""
+
+    def end(v, n):
+        x, v0 = 2 * np.sin(1.0 + np.arange(n)), np.cos(3.0 * np.arange(n))
+        return nsjax.solve(Blocks(v, n), 0.0, 9.0, State(x, v0), throw=False).y1.x
+
+    for way in (lambda f: f, jax.jacfwd):
+        programs = [jax.make_jaxpr(way(lambda v, n=n: end(v, n)))(0.2) for n in (6, 12)]
+        few, many = (sum(1 for _ in equations_of(program.jaxpr)) for program in programs)
+        assert many < 1.4 * few, (few, many)
