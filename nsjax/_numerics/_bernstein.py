@@ -7,6 +7,7 @@ that each root is isolated or excluded.
 
 import functools as ft
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -72,6 +73,11 @@ def deflate(a: list[Array], roots: Int[Array, "..."]) -> list[Array]:
 def largest(a: list[Array]) -> Array:
     """The largest absolute value among the Bernstein coefficients, a bound of the polynomial on [0, 1]."""
     return ft.reduce(jnp.maximum, [jnp.abs(x) / w for x, w in zip(a, binomials(len(a) - 1))])
+
+
+def lowest(a: list[Array]) -> Array:
+    """The least among the Bernstein coefficients, a lower bound of the polynomial on [0, 1]."""
+    return ft.reduce(jnp.minimum, [x / w for x, w in zip(a, binomials(len(a) - 1))])
 
 
 def _horner(a: list[Array], x: Array) -> Array:
@@ -234,3 +240,32 @@ def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar
     place = jnp.where(polished, _polish(chosen, polished), jnp.where(begun, 0.0, 0.5))
     root = (index.astype(dtype) + place) * 0.5 ** level.astype(dtype)
     return found, jnp.where(found, root, one)
+
+
+FEW = 8  # polynomials looked at together, of many
+
+
+def first_roots(
+    a: list[Float[Array, "polynomials parts"]], wanted: Callable[[], Bool[Array, " polynomials"]]
+) -> tuple[Bool[Array, " polynomials"], Array]:
+    """`first_root` of each of them. Of many, most are positive all along, and only the others are looked at, as far as
+    they are wanted."""
+    count = len(a[0])
+    if count <= 4 * FEW:
+        return jax.vmap(first_root)(a)
+    busy = ~no_root(a) & wanted()
+    rank = jnp.cumsum(busy.astype(jnp.int32))
+    nothing = jnp.full(count + FEW, count, jnp.int32)
+    order = nothing.at[jnp.where(busy, rank - 1, count + FEW)].set(jnp.arange(count, dtype=jnp.int32), mode="drop")
+    table = jnp.stack(a, axis=-1)
+
+    def look(carry: tuple) -> tuple:
+        start, found, root = carry
+        place = jax.lax.dynamic_slice(order, (start,), (FEW,))
+        some = table.at[place].get(mode="clip")
+        new = jax.vmap(first_root)([some[..., j] for j in range(len(a))])
+        found, root = (x.at[place].set(y, mode="drop") for x, y in zip((found, root), new))
+        return start + FEW, found, root
+
+    start = (jnp.zeros((), jnp.int32), jnp.zeros(count, bool), jnp.ones(count, a[0].dtype))
+    return jax.lax.while_loop(lambda carry: carry[0] < rank[-1], look, start)[1:]

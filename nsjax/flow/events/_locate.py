@@ -12,13 +12,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..._numerics._autodiff import frozen
 from ..._numerics._barrier import once
-from ..._numerics._bernstein import at, deflate, falls, first_root, largest
+from ..._numerics._bernstein import at, deflate, falls, first_roots, largest, lowest
 from ..._numerics._jaxpr import dependence
 from ..._numerics._linalg import coloured
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ..steppers._stepper import Stepper
+
+
+NEAR = 0.1  # of the size of a guard: of many, only those that come so near to zero count for `Solution.margin`
 
 
 class Interval(NamedTuple):
@@ -95,7 +98,12 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
     first = jnp.arange(known.shape[1]) == 0
     lows = [jnp.where(first, x, -1.0) for x in falls(polynomials)]
     both = [jnp.concatenate(pair) for pair in zip(deflate(polynomials, known), lows)]
-    (found, turns), (root, low) = (jnp.split(x, 2) for x in jax.vmap(first_root)(both))
+
+    def wanted() -> Bool[Array, " rows"]:  # a guard that stays far from zero is not nearly missed
+        near = jnp.any(lowest(polynomials) < NEAR * largest(polynomials), axis=-1)
+        return jnp.concatenate([jnp.ones_like(near), near])
+
+    (found, turns), (root, low) = (jnp.split(x, 2) for x in first_roots(both, wanted))
     single = single & (known[:, 0] == 0)
     turns = turns & (low > 0) & single
     args = (model, t, y, f0, state)
