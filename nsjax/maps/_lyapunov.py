@@ -193,7 +193,8 @@ def _follow(
 
 
 def standard_errors(rates: Float[Array, "span exponents"]) -> Float[Array, " exponents"]:
-    """The largest that blocks of 1, 2, 4, ... intervals give: rates that follow one another are not independent."""
+    """The largest that the three longest blocks of 1, 2, 4, ... intervals give: rates that follow one another are not
+    independent, and those of an orbit of several intervals cancel in long blocks only."""
     span, found = len(rates), []
     length = 1
     while length == 1 or span // length >= BLOCKS:
@@ -201,7 +202,7 @@ def standard_errors(rates: Float[Array, "span exponents"]) -> Float[Array, " exp
         means = jnp.mean(rates[: blocks * length].reshape(blocks, length, -1), axis=1)
         found.append(jnp.std(means, axis=0, ddof=1) / blocks**0.5)
         length *= 2
-    error = jnp.max(jnp.stack(found), axis=0)
+    error = jnp.max(jnp.stack(found[-3:]), axis=0)
     return jnp.where(jnp.isfinite(jnp.mean(rates, axis=0)), error, jnp.nan)
 
 

@@ -1,47 +1,18 @@
 """Charts of attractors: every label against what is known, or against an independent simulation."""
 
 import re
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from exponents import after, ImpactOscillator, largest_exponent
-from models import CHEAP, PeriodicHammer
+from models import Beats, CHEAP, Logistic, PeriodicHammer
 
 import nsjax
 from nsjax.gallery import Motion
 from nsjax.maps._itinerary_class import ItineraryClasses
 from nsjax.maps._settled import settled
-
-
-class Beats(NamedTuple):
-    x: float
-    phase: float
-
-
-class Logistic(nsjax.System):
-    """At each beat x becomes a x (1 - x). A switch tells on which side of a threshold x is, and does nothing."""
-
-    a: float = 3.2
-    middle: float = 0.6
-    pause: float = 1.0  # between beats
-
-    def vector_field(self, t, y, s):
-        return Beats(jnp.zeros_like(y.x), 1 / self.pause + jnp.zeros_like(y.phase))
-
-    @nsjax.impact
-    def beat(self, t, y):
-        return 1 - y.phase
-
-    @beat.reset
-    def beat(self, t, y):
-        return Beats(self.a * y.x * (1 - y.x), y.phase - 1)
-
-    @nsjax.sgn
-    def side(self, t, y):
-        return y.x - self.middle
 
 
 START = Beats(0.3712, 0.25)

@@ -389,3 +389,31 @@ def impact(gap, e=0.5):
     v = -e * jnp.sin(hit)
     late = 3.0 + hit
     return jnp.stack([wall * jnp.cos(late) + v * jnp.sin(late), -wall * jnp.sin(late) + v * jnp.cos(late)])
+
+
+class Beats(NamedTuple):
+    x: float
+    phase: float
+
+
+class Logistic(nsjax.System):
+    """At each beat x becomes a x (1 - x). A switch tells on which side of a threshold x is, and does nothing."""
+
+    a: float = 3.2
+    middle: float = 0.6
+    pause: float = 1.0  # between beats
+
+    def vector_field(self, t, y, s):
+        return Beats(jnp.zeros_like(y.x), 1 / self.pause + jnp.zeros_like(y.phase))
+
+    @nsjax.impact
+    def beat(self, t, y):
+        return 1 - y.phase
+
+    @beat.reset
+    def beat(self, t, y):
+        return Beats(self.a * y.x * (1 - y.x), y.phase - 1)
+
+    @nsjax.sgn
+    def side(self, t, y):
+        return y.x - self.middle

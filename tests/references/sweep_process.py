@@ -13,11 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from models import Beats, CHEAP, Logistic
 
 import nsjax
 
 
 BLOCK, WIDE = 512, 200
+OVER = {"a": np.array([2.8, 3.2, 3.5, 3.7, 3.8]), "middle": np.array([0.6, 0.52])}
+BEATS = dict(section="beat", max_time=3.0, max_iterates=128, chunk=4, **CHEAP)
 
 
 class Iterated(NamedTuple):
@@ -108,6 +111,9 @@ def devices(folder):
             got = transform(lambda x, k, m=m: total(x, k, m), (0, 1))(few, 0.7)
             gaps += [float(abs(np.asarray(a) - np.asarray(b)).max()) for a, b in zip(got, want)]
     found["derivatives"] = max(gaps)
+    charts = [nsjax.attractor_chart(Logistic(), OVER, Beats(0.37, 0.25), devices=n, **BEATS) for n in (None, 1, 2)]
+    found["charts"] = [digest((c.periods, c.classes, c.chaotic, c.exponents, c.ys)) for c in charts]
+    found["chart"] = sorted(set(charts[0].kinds().ravel()))
     found["errors"] = {
         "within jit": failure(lambda: jax.jit(lambda x: nsjax.sweep(jnp.sin, x, devices=2))(few)),
         "within derivatives": failure(lambda: jax.jacfwd(lambda k: nsjax.sweep(lambda x: k * x, few, devices=2))(1.0)),

@@ -41,6 +41,7 @@ def test_two_devices(tmp_path):
     assert len(found["places"]) == 6 and all(place.startswith("P('lanes',") for place in found["places"].values())
 
     assert found["derivatives"] < 1e-12
+    assert len(set(found["charts"])) == 1 and {"chaos", "period 1", "period 4"} <= set(found["chart"])
     errors = found["errors"]
     for where in ("within jit", "within derivatives"):
         assert "must be a `jax.sharding.Mesh` within `jax.jit`, `jax.vmap` and derivatives, but is 2" in errors[where]
