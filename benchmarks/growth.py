@@ -27,7 +27,7 @@ from nsjax.gallery import Motion
 
 LANES = 256  # of the panels in which something else grows: one chunk
 TOL = 1e-8
-LAST = 3  # points over which a slope is taken
+LAST = {"blocks": 5}  # points over which a slope is taken, else three
 
 
 class Row(NamedTuple):
@@ -75,7 +75,7 @@ def events() -> Iterator[Case]:
 
 def blocks() -> Iterator[Case]:
     belts = jnp.linspace(0.1, 1.0, LANES)
-    for n in (1, 2, 5, 10, 20):
+    for n in (1, 2, 5, 10, 20, 50):
         y0 = Blocks(2 * jnp.sin(1.0 + jnp.arange(n)), jnp.cos(3.0 * jnp.arange(n)))
         yield "10 units of time", n, jax.vmap(lambda v: final(Chain(n, v), 10.0, y0)), belts
 
@@ -115,8 +115,9 @@ def measured(panel: str, line: str, x: int, fn: Callable[[jax.Array], Any], valu
     return Row(panel, line, x, len(values), program.seconds, program.compile_seconds, program.bytes)
 
 
-def plot(ax: Any, line: str, x: list[int], y: list[float], **style: Any) -> None:
-    slope = np.polyfit(np.log(x[-LAST:]), np.log(y[-LAST:]), 1)[0]
+def plot(ax: Any, panel: str, line: str, x: list[int], y: list[float], **style: Any) -> None:
+    last = LAST.get(panel, 3)
+    slope = np.polyfit(np.log(x[-last:]), np.log(y[-last:]), 1)[0]
     ax.plot(x, y, markersize=4, label=f"{line}: slope {slope:.2f}", **style)
 
 
@@ -126,11 +127,11 @@ def draw(ax: Any, panel: str, rows: list[Row]) -> None:
         found = [r for r in rows if r.line == line]
         x = [r.x for r in found]
         style = dict(marker="os^"[i], color=f"C{i}")
-        plot(ax, line, x, [r.seconds for r in found], **style)
+        plot(ax, panel, line, x, [r.seconds for r in found], **style)
         if right:
-            plot(right, f"{line}, memory", x, [r.bytes / 1e6 for r in found], linestyle=":", **style)
+            plot(right, panel, f"{line}, memory", x, [r.bytes / 1e6 for r in found], linestyle=":", **style)
         if panel == "blocks":
-            plot(ax, "compile time", x, [r.compile_seconds for r in found], marker="s", color="0.5", linestyle="--")
+            plot(ax, panel, "compile time", x, [r.compile_seconds for r in found], marker="s", color="0.5", linestyle="--")
     ax.set(xscale="log", yscale="log", xlabel=PANELS[panel].xlabel, ylabel="time of all lanes [s]")
     ax.set_title(PANELS[panel].title, fontsize="medium")
     ax.grid(True, which="major", color="0.9")
