@@ -131,7 +131,16 @@ def draw(ax: Any, panel: str, rows: list[Row]) -> None:
         if right:
             plot(right, panel, f"{line}, memory", x, [r.bytes / 1e6 for r in found], linestyle=":", **style)
         if panel == "blocks":
-            plot(ax, panel, "compile time", x, [r.compile_seconds for r in found], marker="s", color="0.5", linestyle="--")
+            plot(
+                ax,
+                panel,
+                "compile time",
+                x,
+                [r.compile_seconds for r in found],
+                marker="s",
+                color="0.5",
+                linestyle="--",
+            )
     ax.set(xscale="log", yscale="log", xlabel=PANELS[panel].xlabel, ylabel="time of all lanes [s]")
     ax.set_title(PANELS[panel].title, fontsize="medium")
     ax.grid(True, which="major", color="0.9")

@@ -53,41 +53,74 @@ MOVING: dict[str, Callable[..., Any]] = {
 }
 
 
-def _masks(jaxpr: Any, inputs: list[np.ndarray], jumps: list[str] | None = None) -> list[np.ndarray]:
-    """Which entries of the results depend on the marked entries of the inputs; too many rather than too few. `jumps`
-    gathers the operations that jump and are applied to such entries."""
-    jumps = [] if jumps is None else jumps
-    known = dict(zip(jaxpr.invars, inputs))
+Mask = np.ndarray  # of booleans, as large as the array of whose entries it tells
 
-    def shape(v: Any) -> tuple[int, ...]:
-        return getattr(v.aval, "shape", ())
 
-    def read(v: Any) -> np.ndarray:
-        return known[v] if not isinstance(v, jex.Literal) and v in known else np.zeros(shape(v), bool)
+def _masks(jaxpr: Any, inputs: list[Mask], leapt: list[Mask] | None = None) -> tuple[list[Mask], list[Mask]]:
+    """Which entries of the results depend on the marked entries of the inputs, and which by way of an operation that
+    jumps (or on the entries that are marked as `leapt` already); too many rather than too few."""
+    known = dict(zip(jaxpr.invars, zip(inputs, leapt or [np.zeros_like(m) for m in inputs])))
+
+    def read(v: Any) -> tuple[Mask, Mask]:
+        none = np.zeros(getattr(v.aval, "shape", ()), bool)
+        return (none, none) if isinstance(v, jex.Literal) else known.get(v, (none, none))
 
     for e in jaxpr.eqns:
-        have, name = [read(v) for v in e.invars], e.primitive.name
-        real = any(m.any() and jnp.issubdtype(v.aval.dtype, jnp.inexact) for v, m in zip(e.invars, have))
-        whole = any(not jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in e.outvars)
-        if real and (name in _JUMPING or (whole and name not in ("is_finite", *_CALLS))):
-            jumps.append(name)
+        pairs, name = [read(v) for v in e.invars], e.primitive.name
+        have, leaps = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
         inner = [p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr)]
-        if not any(m.any() for m in have):
-            out = [np.zeros(shape(v), bool) for v in e.outvars]
-        elif name in ELEMENTWISE:
-            out = [np.any(np.broadcast_arrays(*have), axis=0)]
-        elif name in MOVING:
-            moved = MOVING[name](e.params, *have)
-            out = moved if isinstance(moved, list) else [moved]
-        elif name == "dot_general" and not e.params["dimension_numbers"][1][0]:
-            left, right = (m.any(tuple(axes)) for m, axes in zip(have, e.params["dimension_numbers"][0]))
-            out = [np.logical_or.outer(left, right)]
-        elif name in _CALLS and len(inner) == 1:
-            out = _masks(inner[0].jaxpr, have, jumps)
+        if name in _CALLS and len(inner) == 1 and any(m.any() for m in have):
+            out = _masks(inner[0].jaxpr, have, leaps)
         else:
-            out = [np.ones(shape(v), bool) for v in e.outvars]
-        known.update(zip(e.outvars, out))
-    return [read(v) for v in jaxpr.outvars]
+            out = _passed_on(e, have), _passed_on(e, leaps)
+            real = any(m.any() and jnp.issubdtype(v.aval.dtype, jnp.inexact) for v, m in zip(e.invars, have))
+            whole = any(not jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in e.outvars)
+            if real and (name in _JUMPING or (whole and name != "is_finite")):
+                out = out[0], out[0]
+        known.update(zip(e.outvars, zip(*out)))
+    pairs = [read(v) for v in jaxpr.outvars]
+    return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+
+
+def _passed_on(e: Any, have: list[Mask]) -> list[Mask]:
+    """Which entries of the results of an operation depend on the marked entries of its operands."""
+    name = e.primitive.name
+    if not any(m.any() for m in have):
+        return [np.zeros(getattr(v.aval, "shape", ()), bool) for v in e.outvars]
+    if name in ELEMENTWISE:
+        return [np.any(np.broadcast_arrays(*have), axis=0)]
+    if name in MOVING:
+        moved = MOVING[name](e.params, *have)
+        return moved if isinstance(moved, list) else [moved]
+    if name == "dot_general" and not e.params["dimension_numbers"][1][0]:
+        left, right = (m.any(tuple(axes)) for m, axes in zip(have, e.params["dimension_numbers"][0]))
+        return [np.logical_or.outer(left, right)]
+    return [np.ones(getattr(v.aval, "shape", ()), bool) for v in e.outvars]
+
+
+def _of_leaves(fn: Callable[[Any], Any], x: Any) -> tuple[list[bool], list[bool]]:
+    """Which leaves of `fn(x)` depend on `x`, and which by way of an operation that jumps."""
+    jaxpr = jax.make_jaxpr(fn)(x).jaxpr
+    reached, leapt = _masks(jaxpr, [np.ones(v.aval.shape, bool) for v in jaxpr.invars])
+    return [bool(m.any()) for m in reached], [bool(m.any()) for m in leapt]
+
+
+def touched(fn: Callable[[Any], Any], x: Any) -> list[bool]:
+    """Which leaves of `fn(x)` depend on `x`."""
+    return _of_leaves(fn, x)[0]
+
+
+def jumps(fn: Callable[[Any], Any], x: Any) -> list[bool]:
+    """Which leaves of `fn(x)` are made with an operation that jumps, of a number that depends on `x`."""
+    return _of_leaves(fn, x)[1]
+
+
+def bends_and_jumps(fn: Callable[[Any], Any], x: Any) -> tuple[list[bool], list[bool]]:
+    """Which leaves of `fn(x)` are not structurally affine in `x`, as their derivatives depend on where they are taken
+    or they jump (the derivative of a staircase is constant too); and which jump."""
+    dx, leaps = jax.tree.map(jnp.ones_like, x), jumps(fn, x)
+    moves = touched(lambda x: jax.jvp(fn, (x,), (dx,))[1], x)
+    return [a or b for a, b in zip(leaps, moves, strict=True)], leaps
 
 
 def is_constant(fn: Callable[[Any], Any], x: Any) -> bool:
@@ -95,25 +128,9 @@ def is_constant(fn: Callable[[Any], Any], x: Any) -> bool:
     return not any(touched(fn, x))
 
 
-def touched(fn: Callable[[Any], Any], x: Any) -> list[bool]:
-    """Which leaves of `fn(x)` depend on `x`."""
-    jaxpr = jax.make_jaxpr(fn)(x).jaxpr
-    return [bool(m.any()) for m in _masks(jaxpr, [np.ones(v.aval.shape, bool) for v in jaxpr.invars])]
-
-
 def is_affine(fn: Callable[[Any], Any], x: Any) -> bool:
-    """Whether `fn` is structurally affine in `x`: its derivative does not depend on where it is taken, and it does not
-    jump (the derivative of a staircase is constant too)."""
-    dx = jax.tree.map(jnp.ones_like, x)
-    return not may_jump(fn, x) and is_constant(lambda x: jax.jvp(fn, (x,), (dx,))[1], x)
-
-
-def may_jump(fn: Callable[[Any], Any], x: Any) -> bool:
-    """Whether `fn` holds an operation that jumps, of a number that depends on `x`."""
-    jaxpr = jax.make_jaxpr(fn)(x).jaxpr
-    met: list[str] = []
-    _masks(jaxpr, [np.ones(v.aval.shape, bool) for v in jaxpr.invars], met)
-    return bool(met)
+    """Whether `fn` is structurally affine in `x`."""
+    return not any(bends_and_jumps(fn, x)[0])
 
 
 def dependence(fn: Callable[[Any], Any], x: Any) -> np.ndarray:
@@ -125,5 +142,5 @@ def dependence(fn: Callable[[Any], Any], x: Any) -> np.ndarray:
         for i in np.ndindex(mask.shape):
             marked = mask.copy()
             marked[i] = True
-            columns.append([m.any() for m in _masks(jaxpr, [*none[:n], marked, *none[n + 1 :]])])
+            columns.append([m.any() for m in _masks(jaxpr, [*none[:n], marked, *none[n + 1 :]])[0]])
     return np.array(columns, bool).reshape(len(columns), len(jaxpr.outvars)).T

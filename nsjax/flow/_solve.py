@@ -15,7 +15,7 @@ from jaxtyping import Array, Int
 
 from .._numerics._autodiff import dense_jacobian, forward_only, frozen
 from .._numerics._compile import interactive
-from .._numerics._jaxpr import is_affine, may_jump
+from .._numerics._jaxpr import bends_and_jumps, jumps
 from .._numerics._linalg import WRITTEN_OUT
 from .._numerics._merge import merged
 from .._numerics._text import known, suggesting
@@ -100,17 +100,15 @@ def _flow(
     integrator, request = options.integrator, Request.of(options.saveat)
     t, slots = span[0], range(len(model.slots))
 
-    def guard(i: int, ty: tuple[Scalar, Y]) -> list[Scalar]:
-        return model.guards(*ty, state, wanted=tuple(j == i for j in slots))[i]
+    def guards(ty: tuple[Scalar, Y]) -> list[Array]:
+        return [jnp.stack(row) for row in model.guards(*ty, state)]
 
-    def origin(i: int, ty: tuple[Scalar, Y]) -> Any:
-        """What a guard is made of: where multipliers are solved for, comparisons say nothing of jumps."""
-        if not model.slots[i].holding:
-            return guard(i, ty)
-        k = model.slots[i].switch
-        return model.rates(model.holdable, *ty, state, model.signs(ty[0], state)), model.bound(k)
+    def rates(ty: tuple[Scalar, Y]) -> Any:
+        """What multipliers are made of: where they are solved for, comparisons say nothing of jumps."""
+        return model.rates(model.holdable, *ty, state, model.signs(ty[0], state))
 
-    affine = tuple(is_affine(ft.partial(guard, i), (t, y)) for i in slots)
+    bent, leaps = bends_and_jumps(guards, (t, y))
+    wild = any(bent[i] for i in slots if model.slots[i].holding) and any(jumps(rates, (t, y)))
     return Flow(
         model=model,
         stepper=stepper,
@@ -123,8 +121,8 @@ def _flow(
         want_points=options.saveat.dense or request.ts is not None,
         still=options.still,
         meter=options.meter,
-        affine=affine,
-        jumpy=tuple(not affine[i] and may_jump(ft.partial(origin, i), (t, y)) for i in slots),
+        affine=tuple(not b for b in bent),
+        jumpy=tuple(bent[i] and (wild if model.slots[i].holding else leaps[i]) for i in slots),
         reverse=isinstance(integrator.adjoint, dfx.RecursiveCheckpointAdjoint),
         seen=seen_numbers(model, t, y, state) if len(model.switches) > WRITTEN_OUT else (),
     )

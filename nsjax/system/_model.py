@@ -8,6 +8,7 @@ being held on m surfaces at once solves m equations for the m multipliers, n_i .
 """
 
 import functools as ft
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -18,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._autodiff import frozen
-from .._numerics._jaxpr import dependence, is_affine, is_constant, touched
+from .._numerics._jaxpr import dependence, is_affine, is_constant
 from .._types import Mode, Scalar, Y
 from ._clocked import Clocked
 from ._coupling import Coupling
@@ -53,47 +54,42 @@ class SwitchedSystem(Clocked):
         super().__init__(system, direction)
         self.parts = tuple(len(k.components(system, t, y)) for k in self.switches)
         zeros = tuple(jnp.zeros((), jnp.result_type(t)) for _ in self.switches)
-        one = jnp.ones_like(t)
+        one, order = jnp.ones_like(t), [switch.order for switch in self.switches]
 
-        def rate(k: int, t: Scalar, y: Y, s: tuple) -> Any:
-            return jax.jvp(lambda t, y: self.h(k, t, y), (t, y), (one, self.field(t, y, s)))[1]
+        def rates(which: list[int], t: Scalar, y: Y, s: tuple) -> list[tuple[Scalar, ...]]:
+            def h(t: Scalar, y: Y) -> list[tuple[Scalar, ...]]:
+                return [self.h(k, t, y) for k in which]
 
-        def second(k: int, s: tuple) -> Any:
-            return jax.jvp(lambda t, y: rate(k, t, y, zeros), (t, y), (one, self.field(t, y, s)))[1]
+            return jax.jvp(h, (t, y), (one, self.field(t, y, s)))[1]
 
-        def acts(fn: Any, k: int) -> bool:
-            return not is_constant(lambda sk: fn(zeros[:k] + (sk,) + zeros[k + 1 :]), zeros[k])
+        def second(s: tuple) -> list[tuple[Scalar, ...]]:
+            return jax.jvp(lambda t, y: rates(hard, t, y, zeros), (t, y), (one, self.field(t, y, s)))[1]
 
-        def holds(k: int) -> bool:
-            if self.switches[k].order == 1:
-                return acts(lambda s: rate(k, t, y, s), k)
-            # A contact force that acts on velocities, and so on d²h/dt²; the corner of two walls cannot hold.
-            smooth = self.switches[k].order == 2 and self.parts[k] == 1
-            return smooth and is_constant(lambda s: rate(k, t, y, s), zeros) and acts(lambda s: second(k, s), k)
-
-        self.holdable = tuple(k for k in range(len(self.switches)) if holds(k))
-        self.contacts = tuple(k for k in self.holdable if self.switches[k].order == 2)
+        # A contact is a force that acts on velocities, and so on d²h/dt²; the corner of two walls cannot hold.
+        reach = self._reach(range(len(order)), lambda s: rates(list(range(len(order))), t, y, s), zeros)
+        hard = [k for k, n in enumerate(order) if n == 2 and self.parts[k] == 1 and not reach[k].any()]
+        for k, row in zip(hard, self._reach(hard, second, zeros)):
+            reach[k] = row & row[k]
+        self.holdable = tuple(k for k, n in enumerate(order) if (n == 1 or k in hard) and reach[k, k])
+        self.contacts = tuple(k for k in self.holdable if order[k] == 2)
         self.holding = tuple(self.switches[k].holding for k in self.holdable)
 
         def pulled(values: tuple) -> list[Any]:
             return jax.tree.leaves(self.field(t, y, put(zeros, self.holdable, values)))
 
         nought = tuple(zeros[k] for k in self.holdable)
-        self.acts = tuple(
-            tuple(touched(lambda v, i=i: pulled(put(nought, (i,), (v,))), v)) for i, v in enumerate(nought)
-        )
+        self.acts = tuple(map(tuple, dependence(pulled, nought).T.tolist()))
         self.jointly_affine = is_affine(pulled, nought)
         dry = [k for k in self.holdable if k not in self.contacts]
 
         def effects(args: tuple[Scalar, Y, tuple]) -> list[Any]:
             t, y, s = args
 
-            def of(j: int) -> Any:
-                return jax.jvp(
-                    lambda sj: [rate(k, t, y, s[:j] + (sj,) + s[j + 1 :]) for k in dry], (s[j],), (jnp.ones_like(s[j]),)
-                )[1]
+            def of(ds: tuple) -> Any:
+                return jax.jvp(lambda *held: rates(dry, t, y, put(s, self.holdable, held)), at, ds)[1]
 
-            return [of(j) for j in self.holdable]
+            at = tuple(s[j] for j in self.holdable)
+            return jax.vmap(of)(tuple(jnp.eye(len(at), dtype=one.dtype)))
 
         self.steady = not dry or is_constant(effects, (t, y, zeros))
         self.pairs = ()
@@ -106,7 +102,11 @@ class SwitchedSystem(Clocked):
                 for i in range(j)
                 if (seen[i] & seen[j]).any()
             )
-        self.coupling, self.apart = self._coupled(t, y)
+        # Whether the mode of another one has to do with it: of those whose mode is chosen at an event.
+        free = np.array([k in self.contacts or n == 1 for k, n in enumerate(order)], bool)
+        others = (reach | reach.T) & free & ~np.eye(len(order), dtype=bool)
+        self.apart = tuple((~others.any(axis=1)).tolist())
+        self.coupling = Coupling.of(reach[np.ix_(self.holdable, self.holdable)], self.pairs)
         places = {switch.name: k for k, switch in enumerate(self.switches)} | {"": NONE}
         self.contact = tuple(places[switch.condition] for switch in self.switches)
         slots = []
@@ -116,27 +116,10 @@ class SwitchedSystem(Clocked):
                 slots += [Slot(k, sign, True) for sign in ((1,) if k in self.contacts else (1, -1))]
         self.slots = tuple(slots)
 
-    def _coupled(self, t: Scalar, y: Y) -> tuple[Coupling, tuple[bool, ...]]:
-        """Which values act on which surfaces: on dh/dt, of contacts on d²h/dt²."""
-        number, one = len(self.switches), jnp.ones_like(t)
-        zeros = tuple(jnp.zeros((), jnp.result_type(t)) for _ in self.switches)
-
-        def levels(t: Scalar, y: Y) -> list[Scalar]:
-            h = [self.h(k, t, y) for k in range(number)]
-            for k in self.contacts:
-                h[k] = jax.jvp(ft.partial(self.h, k), (t, y), (one, self.field(t, y, zeros)))[1]
-            return [part for row in h for part in row]
-
-        def rates(values: tuple) -> list[Scalar]:
-            return jax.jvp(levels, (t, y), (one, self.field(t, y, values)))[1]
-
-        owner, acts = np.repeat(np.arange(number), self.parts), dependence(rates, zeros)
-        touches = np.array([acts[owner == k].any(axis=0) for k in range(number)], bool).reshape(number, number)
-        # Whether the mode of another one has to do with it: of those whose mode is chosen at an event.
-        free = np.array([k in self.contacts or switch.order == 1 for k, switch in enumerate(self.switches)], bool)
-        others = (touches | touches.T) & free & ~np.eye(number, dtype=bool)
-        apart = tuple((~others.any(axis=1)).tolist())
-        return Coupling.of(touches[np.ix_(self.holdable, self.holdable)], self.pairs), apart
+    def _reach(self, which: Sequence[int], fn: Callable[[tuple], Any], zeros: tuple) -> np.ndarray:
+        """Which results of `fn` (for each switch in `which` as many as it has components) depend on which values."""
+        owner, acts = np.repeat(np.array(which, int), [self.parts[k] for k in which]), dependence(fn, zeros)
+        return np.array([acts[owner == k].any(axis=0) for k in which], bool).reshape(len(which), len(zeros))
 
     @classmethod
     def forwards(cls, system: System, t: Scalar, y: Y) -> "SwitchedSystem":
@@ -235,10 +218,10 @@ class SwitchedSystem(Clocked):
 
         return jax.jvp(levels, (t, y), (jnp.ones_like(t), self.field(t, y, s)))[1]
 
-    def approach(self, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
-        """dh/dt of switch k along the flow (the active component of h)."""
+    def approach(self, k: int, t: Scalar, y: Y, state: ModeState, f: Y | None = None) -> Scalar:
+        """dh/dt of switch k along the flow (the active component of h). `f`: the field there, if it is known."""
         self = self._in(state)
-        f = self.flow(t, y, state)
+        f = self.flow(t, y, state) if f is None else f
         return jax.jvp(lambda t, y: pick(self.h(k, t, y), state.part[k]), (t, y), (jnp.ones_like(t), f))[1]
 
     def signs(self, t: Scalar, state: ModeState) -> tuple[Any, ...]:

@@ -122,21 +122,23 @@ class _Start:
         """A start so near to a surface that an event there could not be told from the start is on it: the end of a
         period on the surface is off by rounding."""
         model, t, y, state = self.model, self.t, self.y, self.state()
-        for k in model.of_kind(sgn):
-            if k not in self.chosen:
-                instant = 2 * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + self.horizon)
-                h = model.least(k, t, y)
-                near = jnp.abs(h) <= instant * jnp.abs(frozen(model.approach(k, t, y, state)))
-                self.on[k] = self.at[k] = self.on[k] | near
-                self.modes[k] = jnp.where(self.on[k], 0, self.modes[k])
+        free = [k for k in model.of_kind(sgn) if k not in self.chosen]
+        f = model.flow(t, y, state) if free else None
+        for k in free:
+            instant = 2 * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + self.horizon)
+            h = model.least(k, t, y)
+            near = jnp.abs(h) <= instant * jnp.abs(frozen(model.approach(k, t, y, state, f)))
+            self.on[k] = self.at[k] = self.on[k] | near
+            self.modes[k] = jnp.where(self.on[k], 0, self.modes[k])
 
     def refuse_wrong_modes(self) -> None:
         model, t, y, state = self.model, self.t, self.y, self.state()
+        f = model.flow(t, y, state) if self.beyond else None
         for k, gap in self.beyond.items():
             # Near the origin h has no rounding of its own, but a state that an earlier event left there has that of the
             # event's time. So the measure is how soon the surface is crossed, not how large h is.
             soon = AT_ONCE * float(jnp.finfo(t.dtype).eps) ** 0.5 * self.horizon
-            off = gap > soon * jnp.abs(frozen(model.approach(k, t, y, state)))
+            off = gap > soon * jnp.abs(frozen(model.approach(k, t, y, state, f)))
             if model.conditional(k):
                 off = off & ~model.absent(k, state.mode)
             contact = isinstance(model.switches[k], impact)
@@ -154,7 +156,7 @@ class _Start:
                 edge = jnp.where(model.direction < 0, model.edge(k, value, nearly(t)), 0)
                 roots[k] = jnp.where((state.mode[k] == 0) & ((k in self.chosen) | ~self.at[k]), edge, roots[k])
         for k, here in self.on.items():
-            rate = model.approach(k, t, y, state)
+            rate = model.approach(k, t, y, state, f)
             sign = 1 - state.mode[k] if isinstance(model.switches[k], impact) else state.mode[k]
             part = 0 if state.part[k] is None else state.part[k]
             size = model.sizes(lambda t, y, k=k: model.h(k, t, y), t, y, jnp.ones_like(t), f)[part]
