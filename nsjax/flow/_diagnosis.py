@@ -40,7 +40,8 @@ def explain(system: Any, sol: Solution) -> str:
         name = next((model.switches[k].name for k, bad in closes.items() if bad), "name")
         text = (
             f"`{type(system).__name__}.vector_field` must contain `s.{name}` with the sign with which a contact force "
-            f"s.{name} >= 0 opens the gap `{name}`, but it closes it. Change its sign."
+            f"s.{name} >= 0 opens the gap `{name}`, but it closes it. Change its sign, or that of what `{name}` "
+            "returns: it must be positive while the contact is open."
         )
     elif result == RESULTS.jump_in_time:
         text = f"{_jumping(system, sol)} at {where}. {text.partition(') ')[2] or text}"

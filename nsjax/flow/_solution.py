@@ -1,7 +1,7 @@
 """What `solve` returns: saved states, the event log, dense output, and why it ended."""
 
 from collections.abc import Iterator
-from typing import Any, Generic, NamedTuple
+from typing import Any, Generic, NamedTuple, overload
 
 import equinox as eqx
 import jax
@@ -75,8 +75,16 @@ class Events(eqx.Module, Generic[StateT]):
         self._single()
         return int(self.num)
 
-    def __getitem__(self, i: int) -> Event[StateT]:
+    @overload
+    def __getitem__(self, i: int) -> Event[StateT]: ...
+
+    @overload
+    def __getitem__(self, i: slice) -> list[Event[StateT]]: ...
+
+    def __getitem__(self, i: int | slice) -> Event[StateT] | list[Event[StateT]]:
         n = len(self)
+        if isinstance(i, slice):
+            return [self[k] for k in range(*i.indices(n))]
         if not -n <= i < n:
             raise IndexError(f"There are {n} events.")
         # (As NumPy's arrays, of which taking an entry out compiles nothing.)

@@ -224,6 +224,7 @@ def test_printed():
     """Issue 20.16: every result prints itself in a few lines, batched or not."""
     sol = run(t1=90.0, y0=Motion(2.5, 0.0))
     assert str(sol.result).endswith("<successful>")
+    assert [event.t for event in sol.events[-2:]] == [event.t for event in sol.events][-2:] and not sol.events[99:]
     text = str(sol)
     assert len(text.splitlines()) <= 14 and "x = " in text and "belt: belt -1 -> +0" in text and " more ..." in text
     assert repr(sol) == text and "<pre>" in sol._repr_html_() and "&gt;" in sol._repr_html_()
