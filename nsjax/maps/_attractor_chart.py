@@ -104,6 +104,8 @@ def attractor_chart(
     t0: Any = 0.0,
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     max_steps: int = 4096,
     max_events: int = 256,
     chunk: int | None = None,
@@ -137,7 +139,7 @@ def attractor_chart(
     - `section`, `direction`, `max_time`: as for `poincare_map`; by default an iterate is a period of the forcing.
     - `interval`: instead of these, for an autonomous system whose solutions come to rest: how often to look [time].
     - `t0`: the phase of the forcing [time].
-    - `solver`, `stepsize_controller`: as for `solve`. `max_steps`, `max_events`: for each iterate.
+    - `solver`, `stepsize_controller`, `rtol`, `atol`: as for `solve`. `max_steps`, `max_events`: for each iterate.
     - `chunk`, `devices`: how many solutions go together, and on which devices, see `sweep`.
     - `path`: a folder that keeps what is done, a chunk at a time, and from which a call that was interrupted goes on,
         with a larger `max_iterates` too. See `Sweep`.
@@ -158,7 +160,7 @@ def attractor_chart(
     if paths[0] == paths[1]:
         raise ValueError(f"Argument `parameters` must name two parameters, but {names[0]!r} and {names[1]!r} are one.")
     t0, start, _ = checked_start(system, t0, start, None)
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, rtol=rtol, atol=atol)
     system = arrays_of(system, t0.dtype)
     values = [np.asarray(parameters[name], t0.dtype) for name in names]
     for name, value in zip(names, values):

@@ -208,6 +208,8 @@ def basins(
     t0: Any = 0.0,
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     max_steps: int = 4096,
     max_events: int = 256,
 ) -> Basins:
@@ -236,7 +238,7 @@ def basins(
     - `section`, `direction`, `max_time`: as for `poincare_map`, for an autonomous system with periodic orbits; a forced
         one is looked at once in each period, at the phase of `t0` [time].
     - `interval`: instead of these, for an autonomous system whose solutions come to rest: how often to look [time].
-    - `solver`, `stepsize_controller`: as for `solve`. `max_steps`, `max_events`: for each iterate.
+    - `solver`, `stepsize_controller`, `rtol`, `atol`: as for `solve`. `max_steps`, `max_events`: for each iterate.
 
     **Returns:** `Basins`.
 
@@ -251,7 +253,7 @@ def basins(
     if refine and len(shape) != 2:
         raise ValueError(f"Argument `refine` is for grids with two axes, but `starts` have {len(shape)}.")
     t0, like, _ = checked_start(system, t0, jax.tree.map(lambda x: jnp.ravel(x)[0], starts), None)
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, rtol=rtol, atol=atol)
     system = arrays_of(system, t0.dtype)
     step = map_of(system, section, (direction, max_time), interval, (t0, like), integrator)
     lanes = _Lanes(step, system, t0, like, min(8, max_iterates))

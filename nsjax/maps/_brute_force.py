@@ -127,6 +127,8 @@ def brute_force(
     t0: Any = 0.0,
     solver: dfx.AbstractSolver = dfx.Tsit5(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     max_steps: int = 4096,
     max_events: int = 256,
     chunk: int | None = None,
@@ -156,7 +158,7 @@ def brute_force(
     - `carry`: whether each value begins where the solution for the one before it ended, in the order of `values`, which
         follows a branch to where it ends: with `values` rising and falling it shows hysteresis. `starts` are for the
         first. By default every value has all of them.
-    - `solver`, `stepsize_controller`: as for `solve`. `max_steps`, `max_events`: for each point.
+    - `solver`, `stepsize_controller`, `rtol`, `atol`: as for `solve`. `max_steps`, `max_events`: for each point.
     - `chunk`, `devices`: how many solutions go together, and on which devices, see `sweep`.
     - `path`: a folder that keeps what is done, a chunk of solutions at a time, and from which a call that was
         interrupted goes on; see `Sweep`.
@@ -177,7 +179,7 @@ def brute_force(
         )
     one = jax.tree.map(lambda x: x[0], starts)
     t0, y0, _ = checked_start(system, t0, one, None)
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, rtol=rtol, atol=atol)
     place = parameter_path(system, parameter)
     system = arrays_of(system, t0.dtype)
     values = jnp.asarray(values, t0.dtype)

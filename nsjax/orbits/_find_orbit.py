@@ -31,7 +31,7 @@ def _inversion(y: Y) -> Y:
     return jax.tree.map(jnp.negative, y)
 
 
-@suggesting(HINTS | {"T": "Write `period=...`."})
+@suggesting(HINTS | {"T": "Write `period=...`.", "max_iterations": "Write `max_newton_steps=...`."})
 def find_orbit(
     system: System,
     y0: StateT,
@@ -47,8 +47,10 @@ def find_orbit(
     pieces: int = 1,
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     tol: float | None = None,
-    max_iterations: int = 30,
+    max_newton_steps: int = 30,
     max_steps: int = 4096,
     max_events: int = 64,
     adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
@@ -91,9 +93,10 @@ def find_orbit(
         begins, and so is in the same mode. `y0` lies on no surface.
     - `pieces`: into how many pieces of equal length each segment is divided: multiple shooting, for orbits so unstable
         that no single solution follows them.
-    - `solver`, `stepsize_controller`, `max_steps`, `max_events`: as for `solve`; by default Dopri8 with tolerances of
-        1e-12 (float32: 1e-6).
-    - `tol`: tolerance of Newton's method, by default 1e-10 (float32: 1e-4).
+    - `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`, `max_events`: as for `solve`; by default Dopri8 with
+        tolerances of 1e-12 (float32: 1e-6).
+    - `tol`, `max_newton_steps`: of Newton's method, by default 1e-10 (float32: 1e-4) and 30. (`max_steps` are those of
+        each solution.)
     - `adjoint`: `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`; for `jax.grad` and `jax.linearize` (and so for
         optimistix's optimisers) `diffrax.DirectAdjoint()`, at the cost of a forward derivative for each parameter that
         is perturbed.
@@ -108,7 +111,9 @@ def find_orbit(
     orbit, or nowhere.
     """
     t0, y0, given = checked_start(system, t0, y0, mode)
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, (1e-12, 1e-6))
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(
+        t0.dtype, (1e-12, 1e-6), rtol=rtol, atol=atol
+    )
     tol = (1e-10 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4) if tol is None else tol
     symmetry = _inversion if symmetry == "inversion" else symmetry
     _check_method(method, symmetry, backward, segments, pieces, adjoint)
@@ -129,7 +134,7 @@ def find_orbit(
         pieces=pieces,
         concrete=concrete,
         integrator=integrator,
-        newton=Newton(tol, max_iterations),
+        newton=Newton(tol, max_newton_steps),
     )
     if isinstance(adjoint, dfx.DirectAdjoint) and not concrete:
         orbit = dense_jacobian(search.run, system, y0, period)

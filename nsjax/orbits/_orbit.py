@@ -141,10 +141,11 @@ class Orbit(eqx.Module, Generic[StateT]):
         It leaves an orbit that is infinitely unstable at the surface that repels: see `path`.
         """
         end = self.t0 + periods * self.period
+        how = self.integrator.arguments
+        if kwargs.keys() & {"rtol", "atol"}:
+            how = how | dict(stepsize_controller=None)
         mode = tuple(self.mode) if self.events.names else None
-        return solve(
-            self.system, self.t0, end, self.y0, mode=mode, saveat=saveat, **(self.integrator.arguments | kwargs)
-        )
+        return solve(self.system, self.t0, end, self.y0, mode=mode, saveat=saveat, **(how | kwargs))
 
     def __str__(self) -> str:
         if jnp.ndim(self.period):

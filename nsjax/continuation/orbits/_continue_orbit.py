@@ -84,9 +84,13 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         progress: bool = False,
         solver: dfx.AbstractSolver = dfx.Dopri8(),
         stepsize_controller: dfx.AbstractStepSizeController | None = None,
+        rtol: float | None = None,
+        atol: float | None = None,
         max_steps: int = 4096,
     ):
-        integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
+        integrator = Integrator(solver, stepsize_controller, max_steps).checked(
+            jnp.float64, (1e-12, 1e-6), rtol=rtol, atol=atol
+        )
         curve, start = curve_and_start(system, orbit, parameter, interval, scale, integrator)
         start, value = start.filled(), curve.value
         tracer = OrbitTracer(curve, max_step, max_points)
@@ -113,6 +117,8 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         progress: bool = False,
         solver: dfx.AbstractSolver = dfx.Dopri8(),
         stepsize_controller: dfx.AbstractStepSizeController | None = None,
+        rtol: float | None = None,
+        atol: float | None = None,
         max_steps: int = 4096,
     ) -> "OrbitContinuation":
         """Reads what `save` wrote, to go on with it as if nothing had happened. Nothing in the file is executed.
@@ -123,18 +129,20 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         - `system`: a model of the same class and shapes; the values of its parameters are taken from the file.
         - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
             NamedTuples.
-        - `record`, `solver`, `stepsize_controller`, `max_steps`: those with which it was begun.
+        - `record`, `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`: those with which it was begun.
         - `progress`: as for `continue_orbit`.
 
         **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model or solver
         or with other records.
         """
         archive = Archive(path, "OrbitContinuation", cls._types, system, y)
-        integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
+        integrator = Integrator(solver, stepsize_controller, max_steps).checked(
+            jnp.float64, (1e-12, 1e-6), rtol=rtol, atol=atol
+        )
         if plain(repr(integrator)) != archive.part("integrator"):
             raise ValueError(
-                "Arguments `solver`, `stepsize_controller` and `max_steps` must be those with which the branch was "
-                f"begun, {archive.part('integrator')}, but are {plain(repr(integrator))}."
+                "Arguments `solver`, `stepsize_controller`, `rtol`, `atol` and `max_steps` must be those with which "
+                f"the branch was begun, {archive.part('integrator')}, but are {plain(repr(integrator))}."
             )
         recorder = Recorder(record or {})
         if sorted(recorder.measures) != archive.part("record"):
@@ -202,8 +210,9 @@ def continue_orbit(*args: Any, **kwargs: Any) -> OrbitBranch:
         nsjax.plot.orbit_diagram(branch, "P")
         ```
     - `progress`: whether to write to the standard error stream how far it is.
-    - `solver`, `stepsize_controller`, `max_steps`: as for `solve`, of each segment; by default Dopri8 with tolerances
-        of 1e-12. (Where the field is affine in the state between events, segments are matrix exponentials anyway.)
+    - `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`: as for `solve`, of each segment; by default Dopri8
+        with tolerances of 1e-12. (Where the field is affine in the state between events, segments are matrix
+        exponentials anyway.)
 
     **Returns:** the `OrbitBranch` through `orbit`, with the others in `OrbitBranch.others`.
 

@@ -108,6 +108,8 @@ def continue_orbits(
     max_step: float = 0.02,
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     max_steps: int = 4096,
     chunk: int | None = None,
     devices: Devices | None = None,
@@ -137,7 +139,7 @@ def continue_orbits(
     - `parameter`, `interval`: the name of the parameter that varies, and its interval.
     - `points`: the largest number of points each way.
     - `scale`: the typical size of each component of the state; by default what it has along the first orbit.
-    - `max_step`, `solver`, `stepsize_controller`, `max_steps`: as for `continue_orbit`.
+    - `max_step`, `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`: as for `continue_orbit`.
     - `chunk`, `devices`: how many lanes go together, and on which devices, see `sweep`.
     - `path`: a folder that keeps the branches, a chunk of lanes at a time, and from which a call that was interrupted
         goes on; see `Sweep`.
@@ -146,7 +148,9 @@ def continue_orbits(
 
     **Raises:** `ValueError` for an unknown parameter, in single precision, or if no lane has an orbit to start from.
     """
-    integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
+    integrator = Integrator(solver, stepsize_controller, max_steps).checked(
+        jnp.float64, (1e-12, 1e-6), rtol=rtol, atol=atol
+    )
     each = list(orbits) if isinstance(orbits, Sequence) else _unstacked(orbits)
     for one in each:
         check_precision(jnp.result_type(one.t0), "find `orbit`")
