@@ -6,6 +6,7 @@ import tempfile
 from typing import NoReturn
 
 from .._version import __version__
+from ._cache import cache_folder
 from ._diagrams import DIAGRAMS
 from ._job import UsageError
 
@@ -46,6 +47,11 @@ _count.__name__ = "positive integer"  # argparse says "invalid positive integer 
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="nsjax", description="Piecewise-smooth dynamics: the systems of Leine (2000), and your own.")
+    parser.epilog = (
+        f"Compiled programs are kept in {cache_folder()}, so that a second call starts sooner; the environment "
+        "variable JAX_COMPILATION_CACHE_DIR names another folder, and --no-cache neither reads nor writes one. The "
+        "folder may be removed at any time. What a command is doing goes to standard error, unless it is --quiet."
+    )
     parser.add_argument("--version", action="version", version=f"nsjax {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="{list,run,orbit,continue}")
     commands.add_parser("list", help="list the systems of the gallery")
@@ -73,6 +79,8 @@ def _parser() -> argparse.ArgumentParser:
             metavar="FILE",
             help="write the numbers as JSON; - is standard output, and nothing else goes there",
         )
+        add("--no-cache", action="store_true", help=f"compile anew, and keep nothing in {cache_folder()}")
+        add("-q", "--quiet", action="store_true", help="do not tell on standard error what is being done")
         add("--traceback", action="store_true", help="show the whole traceback of an error")
     lasting = "; ".join(f"{key} takes {diagram.lasts}" for key, diagram in DIAGRAMS.items() if diagram.lasts)
     follow.epilog = f"This takes minutes; {lasting}, on one core. How far it is goes to standard error."

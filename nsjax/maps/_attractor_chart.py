@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .._numerics._progress import Counting, ProgressMeter, QUIET
 from .._numerics._text import between, counted, positive, shown
 from .._types import Y
 from ..flow._arguments import checked_start
@@ -111,6 +112,7 @@ def attractor_chart(
     chunk: int | None = None,
     devices: Devices | None = None,
     path: str | os.PathLike | None = None,
+    progress_meter: ProgressMeter = QUIET,
 ) -> AttractorChart:
     """On what solutions settle, over two parameters: the period of the attractor, its itinerary, or chaos.
 
@@ -134,7 +136,8 @@ def attractor_chart(
         each, vectors [unit of the parameter].
     - `start`: the state at `t0` from which all solutions set out.
     - `tol`: points of an attractor that are nearer to each other than this, in each component of the state, are one.
-    - `max_iterates`: after how many iterates to give up; it is rounded up to a multiple of `4 * max_period`.
+    - `max_iterates`: after how many iterates to give up; it is rounded up to a multiple of `4 * max_period` (of an
+        odd `max_period`, of 4 more).
     - `max_period`: the longest period that is looked for, in iterates.
     - `section`, `direction`, `max_time`: as for `poincare_map`; by default an iterate is a period of the forcing.
     - `interval`: instead of these, for an autonomous system whose solutions come to rest: how often to look [time].
@@ -143,6 +146,8 @@ def attractor_chart(
     - `chunk`, `devices`: how many solutions go together, and on which devices, see `sweep`.
     - `path`: a folder that keeps what is done, a chunk at a time, and from which a call that was interrupted goes on,
         with a larger `max_iterates` too. See `Sweep`.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how many solutions are done,
+        how many in a second, and how long the others will take; see `sweep`.
 
     **Returns:** an `AttractorChart`.
 
@@ -173,9 +178,11 @@ def attractor_chart(
         chunk = default_chunk(min(shape[0] * shape[1], 65536), devices_of(devices)[0].platform)
     positive("chunk", chunk)
     _, chunk = even_chunks(shape[0] * shape[1], chunk)
-    window = Window(system, paths, step, t0, start, 4 * max_period, jnp.asarray(tol, t0.dtype))
+    ahead = 8 * -(-max_period // 2)  # in eight parts of one length, by which exponents have their errors
+    window = Window(system, paths, step, t0, start, ahead, jnp.asarray(tol, t0.dtype))
     pairs = np.stack([a.ravel() for a in np.meshgrid(*values, indexing="ij")], axis=-1)
-    found = Pursuit(window, pairs, chunk, devices, path).followed(-(-max_iterates // window.iterates))
+    with Counting(progress_meter, len(pairs), "solutions") as counting:
+        found = Pursuit(window, pairs, chunk, devices, path, counting).followed(-(-max_iterates // window.iterates))
     grid = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), found.lanes)
     ys = jax.vmap(jax.vmap(jfu.ravel_pytree(start)[1]))(grid.x)
     return AttractorChart(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._numerics._progress import ProgressMeter, QUIET
 from .._numerics._text import between, positive, shown, written
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start
@@ -134,6 +135,7 @@ def brute_force(
     chunk: int | None = None,
     devices: Devices | None = None,
     path: str | os.PathLike | None = None,
+    progress_meter: ProgressMeter = QUIET,
 ) -> BruteForce:
     """A brute-force bifurcation diagram: for each value of a parameter, the points at which solutions pierce a Poincaré
     section after a transient.
@@ -162,6 +164,8 @@ def brute_force(
     - `chunk`, `devices`: how many solutions go together, and on which devices, see `sweep`.
     - `path`: a folder that keeps what is done, a chunk of solutions at a time, and from which a call that was
         interrupted goes on; see `Sweep`.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how many lanes are done, how
+        many in a second, and how long the others will take; see `sweep`.
 
     **Returns:** a `BruteForce`. Solutions that fail, or return no more, have a `result` that says why.
 
@@ -193,10 +197,18 @@ def brute_force(
     number = len(jax.tree.leaves(starts)[0])
     args = (system, place, step, t0, values, transient, keep)
     if carry:
-        found = sweep_in(path, _Carried(*args), starts, chunk=chunk, devices=devices)
+        found = sweep_in(path, _Carried(*args), starts, chunk=chunk, devices=devices, progress_meter=progress_meter)
         found = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), found)
     else:
         each = jax.tree.map(lambda x: jnp.tile(x, (len(values),) + (1,) * (x.ndim - 1)), starts)
-        found = sweep_in(path, _Apart(*args), jnp.repeat(values, number), each, chunk=chunk, devices=devices)
+        found = sweep_in(
+            path,
+            _Apart(*args),
+            jnp.repeat(values, number),
+            each,
+            chunk=chunk,
+            devices=devices,
+            progress_meter=progress_meter,
+        )
         found = jax.tree.map(lambda x: x.reshape(len(values), number, *x.shape[1:]), found)
     return BruteForce(parameter, values, *found)

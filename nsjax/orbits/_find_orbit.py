@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._numerics._autodiff import dense_jacobian, forward_only
+from .._numerics._progress import ProgressMeter, QUIET
 from .._numerics._root import Newton
 from .._numerics._text import known, suggesting, written
 from .._types import Scalar, StateT, Y
@@ -199,6 +200,7 @@ def find_orbits(
     order: int = 1,
     devices: Devices | None = None,
     path: str | os.PathLike | None = None,
+    progress_meter: ProgressMeter = QUIET,
     **options: Any,
 ) -> list[Orbit[StateT]]:
     """The different periodic orbits that `find_orbit` finds from many starting points, unstable ones included.
@@ -213,6 +215,8 @@ def find_orbits(
     - `devices`: on which devices, see `sweep`.
     - `path`: a folder that keeps what was found, 256 starts at a time, and from which a search that was interrupted
         goes on; see `Sweep`.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how many lanes are done, how
+        many in a second, and how long the others will take; see `sweep`.
 
     **Returns:** the orbits, those to which most starts led first; an empty list if there are none. Subharmonics that
     differ by periods of the forcing only are one orbit.
@@ -226,7 +230,7 @@ def find_orbits(
     def one(start: tuple[Y, Any]) -> Orbit:
         return find_orbit(system, start[0], period=start[1], order=order, throw=False, **options)
 
-    batch = sweep_in(path, one, (starts, guesses), devices=devices)
+    batch = sweep_in(path, one, (starts, guesses), devices=devices, progress_meter=progress_meter)
     arrays, static = eqx.partition(batch, eqx.is_array)
     good = np.flatnonzero(np.asarray(is_okay(batch.result)))
     return distinct_orbits([eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static) for i in good], order)

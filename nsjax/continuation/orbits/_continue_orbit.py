@@ -6,6 +6,7 @@ from typing import Any, Generic
 import diffrax as dfx
 import jax.numpy as jnp
 
+from ..._numerics._progress import ProgressMeter, QUIET, Told
 from ..._numerics._text import shown
 from ..._types import StateT, Y
 from ...flow._integrator import Integrator
@@ -81,13 +82,14 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         max_laps: int = 4,
         virtual: bool = False,
         record: Measures | None = None,
-        progress: bool = False,
+        progress_meter: ProgressMeter = QUIET,
         solver: dfx.AbstractSolver = dfx.Dopri8(),
         stepsize_controller: dfx.AbstractStepSizeController | None = None,
         rtol: float | None = None,
         atol: float | None = None,
         max_steps: int = 4096,
     ):
+        told = Told(progress_meter, ends=False)
         integrator = Integrator(solver, stepsize_controller, max_steps).checked(
             jnp.float64, (1e-12, 1e-6), rtol=rtol, atol=atol
         )
@@ -100,7 +102,7 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         max_order = max_laps * int(curve.order)
         explorer = OrbitExplorer(tracer, parameter, max_branches, max_order, Recorder(record or {}), virtual)
         upwards = spot if spot.look.tangent[-1] >= 0 else spot.turned
-        self._begin(explorer, explorer.begin(Tree(), upwards), progress)
+        self._begin(explorer, explorer.begin(Tree(), upwards), told)
 
     def _more(self) -> dict[str, Any]:
         integrator = plain(repr(self._explorer.tracer.curve.integrator))
@@ -114,7 +116,7 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         y: Y | None = None,
         *,
         record: Measures | None = None,
-        progress: bool = False,
+        progress_meter: ProgressMeter = QUIET,
         solver: dfx.AbstractSolver = dfx.Dopri8(),
         stepsize_controller: dfx.AbstractStepSizeController | None = None,
         rtol: float | None = None,
@@ -130,7 +132,7 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
             NamedTuples.
         - `record`, `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`: those with which it was begun.
-        - `progress`: as for `continue_orbit`.
+        - `progress_meter`: as for `continue_orbit`.
 
         **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model or solver
         or with other records.
@@ -154,7 +156,7 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         def for_curve(path: Path) -> dict[str, Any]:
             return dict(free=FreeParameters.of(archive.system, path), integrator=integrator)
 
-        growth = cls._loaded(archive, progress, for_curve, dict(recorder=recorder))
+        growth = cls._loaded(archive, Told(progress_meter, ends=False), for_curve, dict(recorder=recorder))
         for name, value in growth._tree.branches[0][1].points[0].record.items():
             recorder.shapes[name] = value.shape
         return growth
@@ -209,7 +211,9 @@ def continue_orbit(*args: Any, **kwargs: Any) -> OrbitBranch:
         branch = nsjax.continue_orbit(system, orbit, "omega", (0.5, 2.0), record={"P": power, "stick": sticking})
         nsjax.plot.orbit_diagram(branch, "P")
         ```
-    - `progress`: whether to write to the standard error stream how far it is.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how far it is: how many
+        branches and points there are, and where on the last one it is; how many are to come is not known. A function is
+        called with the continuation at each point.
     - `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`: as for `solve`, of each segment; by default Dopri8
         with tolerances of 1e-12. (Where the field is affine in the state between events, segments are matrix
         exponentials anyway.)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ...._numerics._compile import on_host
+from ...._numerics._progress import ProgressMeter, QUIET
 from ...._numerics._text import shown
 from ...._types import Y
 from ....flow._integrator import Integrator
@@ -114,6 +115,7 @@ def continue_orbits(
     chunk: int | None = None,
     devices: Devices | None = None,
     path: str | os.PathLike | None = None,
+    progress_meter: ProgressMeter = QUIET,
 ) -> OrbitBranches:
     """Follows many periodic orbits at once while a parameter varies, each both ways to its first corner.
 
@@ -143,6 +145,8 @@ def continue_orbits(
     - `chunk`, `devices`: how many lanes go together, and on which devices, see `sweep`.
     - `path`: a folder that keeps the branches, a chunk of lanes at a time, and from which a call that was interrupted
         goes on; see `Sweep`.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how many lanes are done, how
+        many in a second, and how long the others will take; see `sweep`.
 
     **Returns:** `OrbitBranches`. Lanes without an orbit to start from, or outside the interval, have no points.
 
@@ -171,7 +175,9 @@ def continue_orbits(
     twice = jax.tree.map(lambda x: np.concatenate([x, x]), (lanes, np.array(good)))
     upwards = np.repeat([1.0, -1.0], len(each))
     follow = _Follow(curve, jnp.asarray(max_step), points)
-    found = on_host(sweep_in(path, follow, *twice, upwards, chunk=chunk, devices=devices))
+    found = on_host(
+        sweep_in(path, follow, *twice, upwards, chunk=chunk, devices=devices, progress_meter=progress_meter)
+    )
     return _gathered(curve, parameter, lanes, found)
 
 
