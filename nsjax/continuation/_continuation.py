@@ -11,9 +11,9 @@ from typing import Any, ClassVar, Generic, ParamSpec, Self, TypeVar
 import jax.numpy as jnp
 
 from .._numerics._progress import Told
+from ..flow._archive import Archive, save, table, Types
 from ..system._model import SwitchedSystem
 from ..system._parameter import parameter_path, Path
-from ._archive import Archive, save, table, Types
 from ._branch import AbstractBranch, BranchSegment
 from ._explorer import AbstractExplorer, Tree
 from ._tracer import P, Trace, Zero

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._numerics._progress import Counting, ProgressMeter, QUIET
-from .._numerics._text import between, counted, positive, shown
+from .._numerics._tables import frame
+from .._numerics._text import between, components, counted, positive, shown
 from .._types import Y
 from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
@@ -60,6 +61,19 @@ class AttractorChart(eqx.Module):
     iterates: Int[np.ndarray, "first second"]
     ys: Y
     result: Int[np.ndarray, "first second"]
+
+    def to_dataframe(self) -> Any:
+        """A row for each solution: the two parameters by their names, what it settled on as a word (`attractor`), the
+        `period`, the `itinerary` in words, `exponent`, `error`, `iterates`, and the components of the state at the end.
+
+        **Returns:** a `pandas.DataFrame`: `pip install nsjax[data]`.
+        """
+        words = np.array([*self.itineraries, ""], dtype=object)  # -1 is the last
+        columns = dict(zip(self.parameters, np.meshgrid(*self.values, indexing="ij")))
+        columns |= dict(attractor=self.kinds(), period=self.periods, itinerary=words[self.classes])
+        columns |= dict(exponent=self.exponents, error=self.errors, iterates=self.iterates)
+        rows = [*columns.items(), *components(self.ys, 2).items()]
+        return frame("AttractorChart.to_dataframe", [(name, np.ravel(x)) for name, x in rows])
 
     @property
     def failed(self) -> Bool[np.ndarray, "first second"]:

@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._numerics._progress import ProgressMeter, QUIET
-from .._numerics._text import between, positive, shown, written
+from .._numerics._tables import frame
+from .._numerics._text import between, components, positive, shown, written
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
-from ..flow._results import outcomes, RESULTS
+from ..flow._results import outcomes, result_names, RESULTS
 from ..orbits._orbit import ravel
 from ..sweeps._devices import Devices
 from ..sweeps._long_sweep import sweep_in
@@ -55,6 +56,20 @@ class BruteForce(eqx.Module):
             f"  points  {written(self.ys, self.ts.ndim)}\n"
             f"  result  {outcomes(self.result)}"
         )
+
+    def to_dataframe(self) -> Any:
+        """A row for each point: the parameter by its name, `start`, `point`, `t`, the components of the state, and the
+        `result` of its solution.
+
+        **Returns:** a `pandas.DataFrame`: `pip install nsjax[data]`.
+        """
+        shape = self.ts.shape
+        _, start, point = np.indices(shape)
+        values = np.broadcast_to(np.asarray(self.values)[:, None, None], shape)
+        result = np.broadcast_to(result_names(self.result)[:, :, None], shape)
+        columns = {self.parameter: values, "start": start, "point": point, "t": np.asarray(self.ts)}
+        rows = [*columns.items(), *components(self.ys, 3).items(), ("result", result)]
+        return frame("BruteForce.to_dataframe", [(name, x.ravel()) for name, x in rows])
 
     def periods(self, tol: float = 1e-4) -> np.ndarray:
         """After how many points each solution repeats itself: 0 where it does not within half of those kept, as in

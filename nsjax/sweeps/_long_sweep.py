@@ -14,7 +14,7 @@ from .._numerics._compile import eager, on_host
 from .._numerics._progress import ProgressMeter, QUIET, Told
 from .._numerics._text import known, positive, shown
 from ._claim import Claims, myself
-from ._dataset import dataset, leaf_names
+from ._dataset import dataframe, dataset, leaf_names
 from ._devices import DeviceQueue, Devices, devices_of
 from ._fingerprint import differences, fingerprint
 from ._folder import Folder
@@ -235,6 +235,11 @@ class Sweep:
         rows = [start + np.flatnonzero(outcome.failed(codes)) for start, codes in self._codes(outcome)]
         at = np.concatenate([np.zeros(0, int), *rows])
         return eqx.combine(jax.tree.map(lambda x: x[at], self._lanes.mapped), self._lanes.rest)
+
+    def to_dataframe(self) -> Any:
+        """`result` as a `pandas.DataFrame` with a row for each lane: the arguments, and what was returned, `RESULTS` by
+        their names. It is in memory as a whole. It needs the package pandas: `pip install nsjax[data]`."""
+        return dataframe(self._fn, self._lanes, self.result())
 
     def to_xarray(self) -> Any:
         """`result` as an `xarray.Dataset` over the dimension `lane`, with the arguments as coordinates. It needs the

@@ -332,6 +332,16 @@ def test_xarray(finished):
     assert int(np.sum(data.result == meanings["max_steps_reached"])) == finished.counts()["max_steps_reached"]
 
 
+def test_dataframe(finished):
+    pytest.importorskip("pandas")
+    rows, found = finished.to_dataframe(), finished.result()
+    assert len(rows) == 1300
+    np.testing.assert_array_equal(rows["x"], X)
+    np.testing.assert_array_equal(rows["turns"], found.turns)
+    np.testing.assert_array_equal(rows["values[0]"], found.values[:, 0])
+    assert rows["result"].value_counts().to_dict() == finished.counts()
+
+
 def test_without_xarray(finished, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "xarray", None)
     with pytest.raises(ImportError, match=r"pip install nsjax\[data\]"):

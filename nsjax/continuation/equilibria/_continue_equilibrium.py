@@ -15,10 +15,10 @@ from ..._numerics._text import shown
 from ..._types import Y
 from ...equilibria._equilibrium import Equilibrium
 from ...equilibria._find_equilibrium import checked_equilibrium, find_equilibrium
+from ...flow._archive import Archive
 from ...system._model import SwitchedSystem
 from ...system._parameter import get_parameter, parameter_path
 from ...system._system import System
-from .._archive import Archive
 from .._checks import check_interval, check_precision, checked_scale
 from .._continuation import AbstractContinuation, growth_types, with_arguments_of
 from .._explorer import Tree

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from ..._numerics._progress import ProgressMeter, QUIET, Told
 from ..._numerics._text import shown
 from ..._types import StateT, Y
+from ...flow._archive import Archive, plain
 from ...flow._integrator import Integrator
 from ...maps._corner_normal_form import Cycle
 from ...orbits._orbit import Orbit
@@ -17,7 +18,6 @@ from ...orbits.segments._itinerary import OrbitItinerary
 from ...orbits.segments._point import PointData
 from ...system._parameter import FreeParameters, Path
 from ...system._system import System
-from .._archive import Archive, plain
 from .._continuation import AbstractContinuation, growth_types, with_arguments_of
 from .._explorer import Tree
 from ._bifurcation import Origin
