@@ -30,6 +30,7 @@ from ._cli import (
     Followed,
     given_mode,
     guess_of,
+    is_off,
     is_ours,
     Job,
     keep_programs,
@@ -44,6 +45,8 @@ from ._cli import (
     raised_inside,
     record,
     report,
+    row_text,
+    scorecard,
     simulation_record,
     start_of,
     tolerances,
@@ -193,9 +196,17 @@ def _continue(args: argparse.Namespace) -> int:
     return 0
 
 
+def _scorecard(args: argparse.Namespace) -> int:
+    off = False
+    for row in scorecard(tuple(args.sections)):
+        off |= is_off(row)
+        STAGES.answer(row_text(row))
+    return FAILURE if off else 0
+
+
 def _complaint(error: BaseException, args: argparse.Namespace) -> str | None:
     """What is said of an error, instead of a page; `None` of one that this package is to blame for."""
-    report = mistake(error, None if args.command == "list" else model_file(args.system))
+    report = mistake(error, model_file(args.system) if hasattr(args, "system") else None)
     if report is not None:
         return f"nsjax: error in {report}\n(--traceback shows all of it)"
     if isinstance(error, UsageError | OSError):
@@ -229,7 +240,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run_command(args: argparse.Namespace) -> int:
-    commands = {"list": lambda _: _list(), "run": _run, "orbit": _orbit, "continue": _continue}
+    commands = {"list": lambda _: _list(), "run": _run, "orbit": _orbit, "continue": _continue, "scorecard": _scorecard}
     try:
         return commands[args.command](args)
     except (Exception, SystemExit) as error:  # a model may end the program that imports it

@@ -89,6 +89,12 @@ class Stages:
             print(text, file=sys.stderr, flush=True)
             self._said = time.monotonic()
 
+    def answer(self, text: str) -> None:
+        """Lines on the standard output, while stages go on."""
+        with self._lock:
+            self._end_line()
+            print(text, flush=True)
+
     def stop(self) -> None:
         """The command is over, or what follows is its answer."""
         if self._thread is not None:

@@ -130,10 +130,10 @@ class Explorer:
 
     def _show_eigenvalues(self, one: Branch, point: int) -> None:
         self.detail.set_axis_on()
-        values = np.asarray(one.eigenvalues[point])
+        values = np.asarray(one.eigenvalues[point], complex)
         values = values[np.isfinite(values)]
         self.detail.axvline(0.0, color="0.75", linewidth=0.9, zorder=0)
-        self.detail.plot(values.real, values.imag, linestyle="none", marker="x", color="C0", markersize=7)
+        self.detail.plot(np.real(values), np.imag(values), linestyle="none", marker="x", color="C0", markersize=7)
         self.detail.margins(0.2)
         self.detail.set_xlabel("Re λ [1/time]")
         self.detail.set_ylabel("Im λ [1/time]")
