@@ -1,5 +1,10 @@
 """nsjax: differentiable piecewise-smooth dynamics in JAX."""
 
+from ._numerics import _stages as _stages  # first: a command tells that it is about to import JAX
+
+
+# isort: split
+
 from . import (
     continuation as continuation,
     derivatives as derivatives,

@@ -1,11 +1,13 @@
 """The command line: `python -m nsjax list`, `run 3.4`, `orbit model.py:Oscillator`, `continue 6.6`."""
 
 import argparse
+import atexit
 import json
+import os
 import pathlib
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import diffrax as dfx
 import jax
@@ -28,6 +30,7 @@ from ._cli import (
     Followed,
     given_mode,
     guess_of,
+    is_off,
     is_ours,
     Job,
     keep_programs,
@@ -42,6 +45,8 @@ from ._cli import (
     raised_inside,
     record,
     report,
+    row_text,
+    scorecard,
     simulation_record,
     start_of,
     tolerances,
@@ -49,6 +54,7 @@ from ._cli import (
     UsageError,
     value_of,
 )
+from ._numerics._stages import is_quiet, STAGES
 from .derivatives._flow_map import solution, with_room
 from .flow._arguments import check_span, checked_start, checked_time
 from .flow._diagnosis import explain
@@ -60,6 +66,7 @@ from .orbits._guess import of_relays
 from .system._system import arrays_of
 
 
+SOLUTION, DRAWING = 6, 4  # [s] the first time, about, on one core of today
 FAILURE = 1  # exit status of a numerical failure; `USAGE` is that of a mistake
 DENSE = dfx.SaveAt(dense=True)
 
@@ -70,7 +77,7 @@ def _simulate(args: argparse.Namespace, job: Job, t0: float, search: bool) -> So
     t1 = job.t1 if args.t1 is None else args.t1
     if t1 is None:
         t1 = t0 + (100.0 if job.system.period is None else 20 * float(job.system.period))
-    note(f"following the solution to t = {t1:g}")
+    note(f"following the solution to t = {t1:g}", first=SOLUTION)
     how, mode = controller(args) | BOUNDS, given_mode(args, job)
     if search:
         start, y0, given = checked_start(job.system, t0, start_of(job), mode)
@@ -135,13 +142,16 @@ def _run(args: argparse.Namespace) -> int:
         orbit, trouble = find(args, job, t0, (job.guess.y0, None), (job.y0, given_mode(args, job)))
     elif search and is_okay(sol.result):
         orbit, trouble = find(args, job, t0, (job.y0, given_mode(args, job)))
+    note("drawing", first=DRAWING)
     files = draw(job, sol, orbit, args.out)
     words = [report(job, sol, orbit, trouble)]
     found = [] if diagram is None else follow(args, job, diagram, orbit)
     if diagram is not None and found:
+        note("drawing the branches")
         files += draw_branches(job, found, diagram, args.out)
         words += ["", *_told(found)]
     out = sys.stderr if args.json == "-" else sys.stdout
+    STAGES.stop()
     print(*words, "", *files, sep="\n", file=out)
 
     def computed() -> dict[str, Any]:
@@ -157,8 +167,9 @@ def _orbit(args: argparse.Namespace) -> int:
     t0 = job.t0 if args.t0 is None else args.t0
     orbit, trouble = find(args, job, t0, (guess_of(args, job), given_mode(args, job)))
     if orbit is None:
-        print(f"nsjax: no periodic orbit: {trouble}", file=sys.stderr)
+        STAGES.say(f"nsjax: no periodic orbit: {trouble}")
         return FAILURE
+    STAGES.stop()
     if args.json != "-":
         print(report(job, None, orbit, None))
     _write_json(args, job, lambda: {"orbit": orbit_record(orbit)})
@@ -176,16 +187,26 @@ def _continue(args: argparse.Namespace) -> int:
     found = follow(args, job, diagram)
     if not found:
         return FAILURE
+    note("drawing the branches")
     files = draw_branches(job, found, diagram, args.out)
     out = sys.stderr if args.json == "-" else sys.stdout
+    STAGES.stop()
     print(report(job, None, None, None), "", *_told(found), "", *files, sep="\n", file=out)
     _write_json(args, job, lambda: branch_record(found))
     return 0
 
 
+def _scorecard(args: argparse.Namespace) -> int:
+    off = False
+    for row in scorecard(tuple(args.sections)):
+        off |= is_off(row)
+        STAGES.answer(row_text(row))
+    return FAILURE if off else 0
+
+
 def _complaint(error: BaseException, args: argparse.Namespace) -> str | None:
     """What is said of an error, instead of a page; `None` of one that this package is to blame for."""
-    report = mistake(error, None if args.command == "list" else model_file(args.system))
+    report = mistake(error, model_file(args.system) if hasattr(args, "system") else None)
     if report is not None:
         return f"nsjax: error in {report}\n(--traceback shows all of it)"
     if isinstance(error, UsageError | OSError):
@@ -202,24 +223,42 @@ def main(argv: list[str] | None = None) -> int:
     **Returns:** the exit status: 0, 1 for a numerical failure, 2 for a word that means nothing or a mistake in a model.
     """
     jax.config.update("jax_enable_x64", True)
-    if argv is None:  # the process is ours
-        keep_programs()
-        collect_rarely()
+    words = sys.argv[1:] if argv is None else argv
     try:
-        args = parse(sys.argv[1:] if argv is None else argv)
+        if (argv is None or sys.stderr.isatty()) and not is_quiet(words):
+            STAGES.start("starting")
+        args = parse(words)
+        if argv is None:  # the process is ours
+            keep_programs(not getattr(args, "no_cache", False))
+            collect_rarely()
+        return _run_command(args)
     except UsageError as error:
-        print(f"nsjax: error: {error}", file=sys.stderr)
+        STAGES.say(f"nsjax: error: {error}")
         return USAGE
-    commands = {"list": lambda _: _list(), "run": _run, "orbit": _orbit, "continue": _continue}
+    finally:
+        STAGES.stop()
+
+
+def _run_command(args: argparse.Namespace) -> int:
+    commands = {"list": lambda _: _list(), "run": _run, "orbit": _orbit, "continue": _continue, "scorecard": _scorecard}
     try:
         return commands[args.command](args)
     except (Exception, SystemExit) as error:  # a model may end the program that imports it
         complaint = _complaint(error, args)
         if complaint is None or (getattr(args, "traceback", False) and not isinstance(error, UsageError)):
             raise
-        print(complaint, file=sys.stderr)
+        STAGES.say(complaint)
         return USAGE
 
 
+def command() -> NoReturn:
+    """The whole of a process. It ends at once: to take JAX apart takes a second, in which nothing is told."""
+    status = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    atexit._run_exitfuncs()
+    os._exit(status)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    command()

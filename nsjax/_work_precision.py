@@ -13,6 +13,7 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 
+from ._numerics._progress import Counting, ProgressMeter, QUIET
 from ._numerics._text import shown
 from ._types import Scalar, Y
 from .flow._solution import Solution
@@ -134,6 +135,7 @@ def work_precision(
     repeats: int = 5,
     max_steps: int = 100_000,
     count: bool = False,
+    progress_meter: ProgressMeter = QUIET,
 ) -> WorkPrecision:
     """Time against error for a quantity of a system, by several methods.
 
@@ -160,6 +162,8 @@ def work_precision(
     - `max_steps`: as for `solve`.
     - `count`: whether to count at how many different times and states the vector field is evaluated, Newton iterations
         of implicit solvers included. (An extra run of each, many times as slow.)
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how many rows of the table are
+        done, and how long the others will take; a function is called with that.
 
     **Returns:** a `WorkPrecision`.
 
@@ -167,33 +171,39 @@ def work_precision(
     """
     check_system(system)
     chosen = methods_for(system) if methods is None else methods
+    rows: list[Row] = []
     doubt = 0.0
-    if reference is None:
-        true, doubt = _reference(system, quantity, max_steps)
-    else:
-        true = _flat(reference)
-    rows = []
-    for name, method in chosen.items():
-        if isinstance(method, dfx.AbstractSolver):
-            method = Method(method)
-        if not isinstance(method, Method):
-            raise TypeError(f"Argument `methods` must have a `Method` or a solver for {name!r}, but got {method!r}.")
-        method = method._replace(max_steps=max_steps)
-        run = jax.jit(lambda system, tol, method=method: quantity(system, method._replace(tolerance=tol)))
-        begin = time.perf_counter()
-        try:
-            compiled = run.lower(system, jnp.asarray(tolerances[0])).compile()
-        except TypeError as problem:  # a series that is not known
-            rows += [Row(name, tol, np.nan, np.nan, 0.0, None, str(problem)) for tol in tolerances]
-            continue
-        compile_seconds = time.perf_counter() - begin
-        for tol in tolerances:
-            seconds, value, failure = _timed(lambda tol=tol: compiled(system, jnp.asarray(tol)), repeats)
-            error, evaluations = np.nan, None
-            if value is not None:
-                error = float(np.max(np.abs(_flat(value) - true)))
-                evaluations = _evaluations(quantity, system, method._replace(tolerance=tol)) if count else None
-            rows.append(Row(name, float(tol), seconds, error, compile_seconds, evaluations, failure))
+    with Counting(progress_meter, len(chosen) * len(tolerances), "rows") as counting:
+        if reference is None:
+            counting.at(0, "the reference")
+            true, doubt = _reference(system, quantity, max_steps)
+        else:
+            true = _flat(reference)
+        for name, method in chosen.items():
+            if isinstance(method, dfx.AbstractSolver):
+                method = Method(method)
+            if not isinstance(method, Method):
+                raise TypeError(
+                    f"Argument `methods` must have a `Method` or a solver for {name!r}, but got {method!r}."
+                )
+            method = method._replace(max_steps=max_steps)
+            counting.at(len(rows), name)
+            run = jax.jit(lambda system, tol, method=method: quantity(system, method._replace(tolerance=tol)))
+            begin = time.perf_counter()
+            try:
+                compiled = run.lower(system, jnp.asarray(tolerances[0])).compile()
+            except TypeError as problem:  # a series that is not known
+                rows += [Row(name, tol, np.nan, np.nan, 0.0, None, str(problem)) for tol in tolerances]
+                continue
+            compile_seconds = time.perf_counter() - begin
+            for tol in tolerances:
+                seconds, value, failure = _timed(lambda tol=tol: compiled(system, jnp.asarray(tol)), repeats)
+                error, evaluations = np.nan, None
+                if value is not None:
+                    error = float(np.max(np.abs(_flat(value) - true)))
+                    evaluations = _evaluations(quantity, system, method._replace(tolerance=tol)) if count else None
+                rows.append(Row(name, float(tol), seconds, error, compile_seconds, evaluations, failure))
+                counting.at(len(rows), name)
     return WorkPrecision(tuple(rows), doubt)
 
 

@@ -30,6 +30,7 @@ from ._report import (
     report as report,
     simulation_record as simulation_record,
 )
+from ._scorecard import is_off as is_off, row_text as row_text, scorecard as scorecard
 from ._search import (
     BOUNDS as BOUNDS,
     controller as controller,

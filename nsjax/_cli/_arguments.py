@@ -6,8 +6,10 @@ import tempfile
 from typing import NoReturn
 
 from .._version import __version__
+from ._cache import cache_folder
 from ._diagrams import DIAGRAMS
-from ._job import UsageError
+from ._job import unknown, UsageError
+from ._scorecard import EQUILIBRIA, NUMBERS_OF, ORBITS
 
 
 USAGE = 2  # exit status
@@ -31,6 +33,9 @@ def parse(argv: list[str]) -> argparse.Namespace:
         _check_folder(args.save, "--save")
     if getattr(args, "json", None) not in (None, "-"):
         _check_file(pathlib.Path(args.json), "--json")
+    for section in getattr(args, "sections", ()):
+        if section not in (NUMBERS_OF, *EQUILIBRIA, *ORBITS):
+            raise unknown("section", section, (NUMBERS_OF, *EQUILIBRIA, *ORBITS))
     return args
 
 
@@ -46,14 +51,31 @@ _count.__name__ = "positive integer"  # argparse says "invalid positive integer 
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="nsjax", description="Piecewise-smooth dynamics: the systems of Leine (2000), and your own.")
+    parser.epilog = (
+        f"Compiled programs are kept in {cache_folder()}, so that a second call starts sooner; the environment "
+        "variable JAX_COMPILATION_CACHE_DIR names another folder, and --no-cache neither reads nor writes one. The "
+        "folder may be removed at any time. What a command is doing goes to standard error, unless it is --quiet."
+    )
     parser.add_argument("--version", action="version", version=f"nsjax {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="{list,run,orbit,continue}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="{list,run,orbit,continue,scorecard}")
     commands.add_parser("list", help="list the systems of the gallery")
     run = commands.add_parser("run", help="simulate a system, find its periodic orbit, write tables and pictures")
     orbit = commands.add_parser("orbit", help="find a periodic orbit")
     follow = commands.add_parser(
         "continue", help="follow a periodic orbit, or equilibria, while a parameter varies, with pictures"
     )
+    card = commands.add_parser(
+        "scorecard", help="compute what the thesis states, and compare: three minutes, or by sections"
+    )
+    card.add_argument(
+        "sections", nargs="*", metavar="SECTION",
+        help=f"only some: numbers, {', '.join([*EQUILIBRIA, *ORBITS])}",
+    )  # fmt: skip
+    for command in (run, orbit, follow, card):
+        add = command.add_argument
+        add("--no-cache", action="store_true", help=f"compile anew, and keep nothing in {cache_folder()}")
+        add("-q", "--quiet", action="store_true", help="do not tell on standard error what is being done")
+        add("--traceback", action="store_true", help="show the whole traceback of an error")
     for command in (run, orbit, follow):
         add = command.add_argument
         add(
@@ -73,7 +95,6 @@ def _parser() -> argparse.ArgumentParser:
             metavar="FILE",
             help="write the numbers as JSON; - is standard output, and nothing else goes there",
         )
-        add("--traceback", action="store_true", help="show the whole traceback of an error")
     lasting = "; ".join(f"{key} takes {diagram.lasts}" for key, diagram in DIAGRAMS.items() if diagram.lasts)
     follow.epilog = f"This takes minutes; {lasting}, on one core. How far it is goes to standard error."
     run.add_argument("--y0", metavar="x=..,v=..", help="where the simulation starts; names of the state, or numbers")

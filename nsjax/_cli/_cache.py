@@ -20,9 +20,12 @@ def cache_folder() -> pathlib.Path:
     return base / "nsjax"
 
 
-def keep_programs() -> None:
+def keep_programs(keep: bool = True) -> None:
     """Compiled programs are written to the user's cache, or where JAX was told to keep them; small ones too, of which a
-    command has several dozen."""
+    command has several dozen. If they are not to be kept, none is read either."""
+    if not keep:
+        jax.config.update("jax_enable_compilation_cache", False)
+        return
     if not jax.config.values.get("jax_compilation_cache_dir"):
         folder = cache_folder()
         try:

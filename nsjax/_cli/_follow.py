@@ -2,10 +2,10 @@
 
 import argparse
 import dataclasses
-import sys
 import warnings
 from typing import Any
 
+from .._numerics._stages import STAGES
 from ..continuation.equilibria._branch import Branch
 from ..continuation.equilibria._continue_equilibrium import continue_equilibrium
 from ..continuation.orbits._branch import OrbitBranch
@@ -20,7 +20,7 @@ from ._family import Family, Followed, Start
 from ._job import Job, model_file
 from ._mistakes import advice, first_line, mistake
 from ._pictures import stem
-from ._search import controller, find, given_mode, Guess, guess_of, note, start_of, try_guess
+from ._search import controller, find, given_mode, Guess, guess_of, meter, note, start_of, try_guess
 
 
 def value_of(system: System, diagram: Diagram) -> float:
@@ -45,11 +45,11 @@ def follow(args: argparse.Namespace, job: Job, diagram: Diagram, orbit: Orbit | 
             value, (low, high) = value_of(start.system, diagram), diagram.interval_of(family)
             if not low <= value <= high:
                 where = f"{diagram.parameter} = {value:g}, which is not in the range"
-                print(f"nsjax: no {what}: its start is at {where}", file=sys.stderr)
+                STAGES.say(f"nsjax: no {what}: its start is at {where}")
                 continue
         branch, trouble = (_equilibria if family.equilibria else _orbits)(args, job, diagram, family, start, orbit)
         if branch is None:
-            print(f"nsjax: no {what}: {trouble}", file=sys.stderr)
+            STAGES.say(f"nsjax: no {what}: {trouble}")
             continue
         found.append(Followed(family, branch))
         if getattr(args, "save", None) is not None:
@@ -80,7 +80,8 @@ def _equilibria(
         )
     note(f"following {family.name or 'the equilibrium'}")
     interval = diagram.interval_of(family)
-    return family.part(continue_equilibrium(start.system, found, diagram.parameter, interval, progress=True)), None
+    branch = continue_equilibrium(start.system, found, diagram.parameter, interval, progress_meter=meter())
+    return family.part(branch), None
 
 
 def _orbits(
@@ -101,8 +102,8 @@ def _orbits(
         orbit, trouble = find(args, job, t0, (guess_of(args, job), given_mode(args, job)))
     if orbit is None:
         return None, trouble
-    note(f"following {family.name or 'the orbit'}")
-    how: dict[str, Any] = dict(max_laps=getattr(args, "max_laps", None) or family.laps, progress=True)
+    note(f"following {family.name or 'the orbit'}", first=20)
+    how: dict[str, Any] = dict(max_laps=getattr(args, "max_laps", None) or family.laps, progress_meter=meter())
     if family.most is not None:
         how["max_branches"] = family.most
     with warnings.catch_warnings():

@@ -1,12 +1,13 @@
 """The search for periodic orbits from the words of the command line."""
 
 import argparse
-import sys
 from typing import Any, NamedTuple
 
 import diffrax as dfx
 
 from .. import gallery
+from .._numerics._progress import ProgressMeter
+from .._numerics._stages import STAGES
 from ..flow._results import RESULTS
 from ..orbits._find_orbit import find_orbit
 from ..orbits._orbit import Orbit
@@ -19,10 +20,20 @@ BOUNDS = dict(max_steps=20_000, max_events=1024)
 Start = tuple[Any, dict[str, int] | None]  # a state, and the modes that were given for it
 
 
-def note(text: str) -> None:
-    """What is under way, for whoever waits: a stream that is no terminal is left to results and errors."""
-    if sys.stderr.isatty():
-        print(f"nsjax: {text} ...", file=sys.stderr)
+def note(text: str, first: int = 0) -> None:
+    """What is under way, for whoever waits.
+
+    **Arguments:**
+
+    - `text`: the stage.
+    - `first`: how long it takes where the program is not in the cache yet, about [s].
+    """
+    STAGES.stage(f"{text} (about {first} s the first time)" if first else text)
+
+
+def meter() -> ProgressMeter:
+    """Of a stage that tells how far it is."""
+    return STAGES.progress if STAGES.on else dfx.TextProgressMeter()
 
 
 def tolerances(args: argparse.Namespace) -> dict[str, float]:
@@ -108,7 +119,7 @@ def find(
         return None, f"neither with {guess.words} nor where the solution settles: {later}"
     why = trouble.partition(". ")[0].rstrip(".")
     found = f"an orbit of period {float(orbit.period):.10g}"
-    print(f"nsjax: with {guess.words}: {why}; found where the solution settles: {found}.", file=sys.stderr)
+    STAGES.say(f"nsjax: with {guess.words}: {why}; found where the solution settles: {found}.")
     return orbit, None
 
 

@@ -18,7 +18,7 @@ class Newton(NamedTuple):
     """When Newton's method ends."""
 
     tol: Any  # relative and absolute, of the unknowns
-    max_iterations: int
+    max_steps: int
 
     def solver(self, well_posed: bool | None = None) -> optx.Newton:
         return optx.Newton(rtol=self.tol, atol=self.tol, linear_solver=lx.AutoLinearSolver(well_posed=well_posed))
@@ -58,7 +58,7 @@ def find_root(
         newton.solver(well_posed),
         frozen(guess),
         args=frozen(parameters),
-        max_steps=newton.max_iterations,
+        max_steps=newton.max_steps,
         throw=False,
     )
     converged = found.result == optx.RESULTS.successful

@@ -11,9 +11,10 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .._numerics._tables import frame
 from .._types import Y
+from ..flow._archive import Archive, save, Types
 from ..system._system import System
-from ._archive import Archive, save, Types
 from ._special_point import AbstractSpecialPoint
 
 
@@ -33,6 +34,7 @@ class AbstractBranch(eqx.Module, Generic[SpecialT]):
     ys: eqx.AbstractVar[Y]
     stable: eqx.AbstractVar[Bool[np.ndarray, " points"]]
     special: eqx.AbstractVar[tuple[SpecialT, ...]]
+    indices: eqx.AbstractVar[tuple[int, ...]]
     ends: eqx.AbstractVar[tuple[str, str]]
     others: eqx.AbstractVar[tuple[Any, ...]]
 
@@ -73,6 +75,34 @@ class AbstractBranch(eqx.Module, Generic[SpecialT]):
         **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model.
         """
         return Archive(path, cls.__name__, cls.saved, system, y).part("branch")
+
+    def to_dataframe(self) -> Any:
+        """A row for each point of this branch and the others, in their order: `branch` (0 is this one), `point`, the
+        parameter by its name, the components of the state by theirs, what else is known of each point, and the name of
+        the special point there (`special`; empty where there is none).
+
+        **Returns:** a `pandas.DataFrame`: `pip install nsjax[data]`.
+        """
+        tables = [one._columns(k) for k, one in enumerate(self.branches)]
+        names = list(dict.fromkeys(name for columns in tables for name in columns))
+        return frame(
+            f"{type(self).__name__}.to_dataframe",
+            [(name, np.concatenate([columns[name] for columns in tables])) for name in names],
+        )
+
+    def _columns(self, number: int) -> dict[str, np.ndarray]:
+        special = np.full(len(self), "", dtype=object)
+        for point, i in zip(self.special, self.indices):
+            special[min(max(i, 0), len(self) - 1)] = point.name
+        columns = dict(branch=np.full(len(self), number), point=np.arange(len(self)))
+        parts = {self.parameter: self.values} | self._further() | dict(stable=self.stable, special=special)
+        for name, values in parts.items():
+            columns[f"{name}_" if name in columns else name] = np.asarray(values)
+        return columns
+
+    @abc.abstractmethod
+    def _further(self) -> dict[str, np.ndarray]:
+        """Columns of a table, by name: what is known of each point, apart from the parameter and stability."""
 
     def __len__(self) -> int:
         return len(self.values)
@@ -144,3 +174,8 @@ def descends(values: Sequence[Any]) -> bool:
     choose its direction."""
     parameters = np.asarray(values, float)
     return bool(parameters[0] - parameters[-1] > 1e-9 * np.ptp(parameters))
+
+
+def named_apart(parts: dict[str, np.ndarray], parameter: str) -> dict[str, np.ndarray]:
+    """The components of a state, of which one may be called as the parameter is: `x_` then."""
+    return {f"{name}_" if name == parameter else name: values for name, values in parts.items()}

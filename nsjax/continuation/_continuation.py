@@ -1,7 +1,6 @@
 """Continuations that are under way, be they of equilibria or of periodic orbits."""
 
 import abc
-import contextlib
 import dataclasses
 import inspect
 import os
@@ -11,10 +10,10 @@ from typing import Any, ClassVar, Generic, ParamSpec, Self, TypeVar
 
 import jax.numpy as jnp
 
-from .._numerics._progress import ProgressLine
+from .._numerics._progress import Told
+from ..flow._archive import Archive, save, table, Types
 from ..system._model import SwitchedSystem
 from ..system._parameter import parameter_path, Path
-from ._archive import Archive, save, table, Types
 from ._branch import AbstractBranch, BranchSegment
 from ._explorer import AbstractExplorer, Tree
 from ._tracer import P, Trace, Zero
@@ -34,10 +33,10 @@ class AbstractContinuation(abc.ABC, Generic[P, BranchT]):
 
     _explorer: AbstractExplorer
     _tree: Tree
-    _line: ProgressLine | None
+    _told: Told
 
-    def _begin(self, explorer: AbstractExplorer, tree: Tree, progress: bool) -> Self:
-        self._explorer, self._tree, self._line = explorer, tree, ProgressLine() if progress else None
+    def _begin(self, explorer: AbstractExplorer, tree: Tree, told: Told) -> Self:
+        self._explorer, self._tree, self._told = explorer, tree, told
         return self
 
     def __iter__(self) -> Self:
@@ -51,14 +50,13 @@ class AbstractContinuation(abc.ABC, Generic[P, BranchT]):
                     f"There are more than `max_branches` = {self._explorer.max_branches} branches.", stacklevel=3
                 )
             if point is not None:
-                if self._line is not None:
-                    self._line.show(self)
+                self._told.show(self)
                 return point
         raise StopIteration
 
     def run(self) -> BranchT:
         """Goes on to the end, and returns the branch."""
-        with contextlib.nullcontext() if self._line is None else self._line:
+        with self._told:
             for _ in self:
                 pass
         return self.branch
@@ -92,7 +90,7 @@ class AbstractContinuation(abc.ABC, Generic[P, BranchT]):
 
     @classmethod
     def _loaded(
-        cls, archive: Archive, progress: bool, for_curve: Callable[[Path], dict[str, Any]], for_explorer: dict[str, Any]
+        cls, archive: Archive, told: Told, for_curve: Callable[[Path], dict[str, Any]], for_explorer: dict[str, Any]
     ) -> Self:
         """From a file, with what that does not hold: of the curve, given the path of its parameter."""
         curve_type, tracer_type, explorer_type = cls._parts
@@ -104,7 +102,7 @@ class AbstractContinuation(abc.ABC, Generic[P, BranchT]):
             **for_curve(parameter_path(archive.system, given["name"])),
         )
         explorer = explorer_type(tracer_type(curve, **archive.part("tracer")), **given, **for_explorer)
-        return cls.__new__(cls)._begin(explorer, archive.part("tree", curve=curve), progress)
+        return cls.__new__(cls)._begin(explorer, archive.part("tree", curve=curve), told)
 
 
 def _given(part: Any) -> dict[str, Any]:

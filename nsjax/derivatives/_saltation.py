@@ -11,18 +11,13 @@ from jaxtyping import Array, Float, Int
 
 from .._numerics._autodiff import frozen
 from .._types import Scalar, Y
+from ..flow._arguments import checked_state, checked_time
 from ..flow._solution import Events
 from ..flow.events._impact import completed, rebound
 from ..system._impact import impact
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, System
-
-
-def _float(t: Any, y: Y) -> tuple[Scalar, Y]:
-    dtype = jnp.result_type(float, *jax.tree.leaves(y)) if jax.tree.leaves(y) else jnp.result_type(float)
-    dtype = jnp.result_type(*jax.tree.leaves(y)) if not any(isinstance(x, float) for x in jax.tree.leaves(y)) else dtype
-    return jnp.asarray(t, dtype), jax.tree.map(lambda x: jnp.asarray(x, dtype), y)
 
 
 def _modes(system: System, mode: Any) -> tuple[Int[Array, ""], ...]:
@@ -175,7 +170,8 @@ def saltation_matrix(
     names = [k.name for k in system.switches]
     if switch not in names:
         raise ValueError(f"Argument `switch` must be one of {', '.join(names) or 'no switches'}, but got {switch!r}.")
-    t, y = _float(t, y)
+    y = checked_state(y)
+    t = checked_time("t", t, jnp.result_type(*jax.tree.leaves(y)))
     system = arrays_of(system, t.dtype)
     model = SwitchedSystem.forwards(system, t, y)
     before, after = _modes(system, mode_before), _modes(system, mode_after)

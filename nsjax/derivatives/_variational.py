@@ -36,6 +36,8 @@ def fundamental_matrix(
     mode: Any = None,
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     max_steps: int = 4096,
     max_events: int = 64,
     throw: bool = True,
@@ -47,8 +49,8 @@ def fundamental_matrix(
 
     **Arguments:**
 
-    - `system`, `t0`, `t1`, `y0`, `mode`, `solver`, `stepsize_controller`, `max_steps`, `max_events`, `throw`: as for
-        `solve` (here Dopri8 and, for float64, tolerances of 1e-10 by default).
+    - `system`, `t0`, `t1`, `y0`, `mode`, `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`, `max_events`,
+        `throw`: as for `solve` (here Dopri8 and, for float64, tolerances of 1e-10 by default).
     - `ts`: times between `t0` and `t1` at which Φ is wanted (before the jump, where it falls on an event).
     - `method`: the route.
 
@@ -62,7 +64,9 @@ def fundamental_matrix(
         raise ValueError(f"Argument `method` must be 'variational' or 'autodiff', but got {method!r}.")
     t0, y0, _ = checked_start(system, t0, y0, mode)
     t1 = checked_time("t1", t1, t0.dtype)
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, (1e-10, 1e-5))
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(
+        t0.dtype, (1e-10, 1e-5), rtol=rtol, atol=atol
+    )
     how: dict[str, Any] = dict(mode=mode, throw=throw) | integrator.arguments
     flat, unravel = jfu.ravel_pytree(y0)
     times = jnp.asarray([t1] if ts is None else ts, t0.dtype)

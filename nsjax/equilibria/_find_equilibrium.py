@@ -34,7 +34,7 @@ def find_equilibrium(
     mode: Any = None,
     t: Any = 0.0,
     tol: float | None = None,
-    max_iterations: int = 50,
+    max_steps: int = 50,
     throw: bool = True,
 ) -> Equilibrium[StateT]:
     """Finds an equilibrium by optimistix's Newton method: f(t, y, s) = 0 in a mode, on surfaces that hold it with their
@@ -52,7 +52,7 @@ def find_equilibrium(
         mode of `y0`; and, if what is found from there is virtual, the admissible one of another mode that is nearest
         to `y0` (this needs concrete values: not under `jit` or `vmap`).
     - `t`: the time at which forces are taken.
-    - `tol`: tolerance of Newton's method, by default 1e-12 (float32: 1e-5).
+    - `tol`, `max_steps`: of Newton's method, by default 1e-12 (float32: 1e-5) and 50.
     - `throw`: whether a failure raises; if not, look at `Equilibrium.result`.
 
     **Returns:** an `Equilibrium`, which may be a virtual one: see `admissible`.
@@ -61,7 +61,7 @@ def find_equilibrium(
     """
     system, y0, t, given, tol = checked_equilibrium(system, y0, t, mode, tol)
     model = SwitchedSystem.forwards(system, t, y0)
-    newton = Newton(tol, max_iterations)
+    newton = Newton(tol, max_steps)
     found = equilibrium_in(system, t, y0, _chosen(system, t, y0, given), newton)
     concrete = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, y0)))
     if concrete and len(given) < len(system.switches) and not (found.result == RESULTS.successful and found.admissible):
@@ -82,13 +82,13 @@ def find_equilibria(
     virtual: bool = False,
     t: Any = 0.0,
     tol: float | None = None,
-    max_iterations: int = 50,
+    max_steps: int = 50,
 ) -> list[Equilibrium[StateT]]:
     """The different equilibria that Newton's method finds from many starting points in every mode.
 
     **Arguments:**
 
-    - `system`, `t`, `tol`: as for `find_equilibrium`.
+    - `system`, `t`, `tol`, `max_steps`: as for `find_equilibrium`.
     - `starts`: states to start from, leaves with a leading axis.
     - `mode`: modes of some or all switches, if only these are wanted.
     - `virtual`: whether virtual ones are wanted too.
@@ -102,7 +102,7 @@ def find_equilibria(
     system, first, t, given, tol = checked_equilibrium(system, first, t, mode, tol)
     starts = jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), starts, first)
     model = SwitchedSystem.forwards(system, t, first)
-    found = _in_all_modes(system, model, t, starts, given, Newton(tol, max_iterations))
+    found = _in_all_modes(system, model, t, starts, given, Newton(tol, max_steps))
     distinct: list[Equilibrium] = []
     for one in sorted(found, key=lambda one: (not one.admissible, bool(one.boundary))):
         size = 1 + float(jnp.max(jnp.abs(ravel(one.y))))

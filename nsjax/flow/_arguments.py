@@ -26,7 +26,7 @@ def checked_start(system: System, t: Any, y: Y, mode: Any) -> tuple[Scalar, Y, d
 
 
 def checked_state(y: Y) -> Y:
-    """A state of arrays of one floating point dtype."""
+    """A state of arrays of one floating point dtype. Integers become floating point numbers."""
     leaves = jax.tree.leaves(y, is_leaf=lambda x: x is None)
     if not leaves:
         raise ValueError("Argument `y0` must hold at least one number, but it is empty.")
@@ -38,15 +38,17 @@ def checked_state(y: Y) -> Y:
             raise TypeError(
                 "Argument `y0` must be real, but has a complex leaf; split it into real and imaginary part."
             )
-        if not isinstance(leaf, (float, int)) and not jnp.issubdtype(kind, jnp.floating):
-            raise TypeError(f"Argument `y0` must be of floating point dtype, but has a leaf of dtype {kind}.")
-        if isinstance(leaf, (bool, int)):
-            raise TypeError(
-                f"Argument `y0` must hold floating point numbers, but has the integer {leaf!r}; write {leaf}.0."
-            )
-    dtype = jnp.result_type(*leaves)
-    dtype = jnp.result_type(float) if all(isinstance(x, float) for x in leaves) else dtype
+        if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+            raise TypeError(f"Argument `y0` must hold floating point numbers, but has a leaf of dtype {kind}.")
+    dtype = floating_dtype(leaves)
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), y)
+
+
+def floating_dtype(leaves: Sequence[Any]) -> Any:
+    """That of the arrays of floating point numbers; where there is none, as of Python's numbers and integers alone, the
+    default one."""
+    own = [x for x in leaves if type(x) not in (float, int) and jnp.issubdtype(jnp.result_type(x), jnp.floating)]
+    return jnp.result_type(*own) if own else jnp.result_type(float)
 
 
 def checked_time(name: str, t: Any, dtype: Any) -> Scalar:

@@ -25,13 +25,21 @@ class Integrator(NamedTuple):
         """Those of `solve`."""
         return self._asdict()
 
-    def checked(self, dtype: Any, tolerance: tuple[float, float] = (1e-8, 1e-5)) -> "Integrator":
+    def checked(
+        self,
+        dtype: Any,
+        tolerance: tuple[float, float] = (1e-8, 1e-5),
+        *,
+        rtol: Any = None,
+        atol: Any = None,
+    ) -> "Integrator":
         """The same with a step size controller and a solver in the form that the loop needs.
 
         **Arguments:**
 
         - `dtype`: that of the state.
         - `tolerance`: the default, in double and in single precision.
+        - `rtol`, `atol`: those of the default controller, in place of `tolerance`.
         """
         solver, adjoint = self.solver, self.adjoint
         if not isinstance(solver, dfx.AbstractSolver):
@@ -46,7 +54,7 @@ class Integrator(NamedTuple):
                 "Argument `adjoint` must not be `RecursiveCheckpointAdjoint` for `Exponential` or `Affine`, whose "
                 "matrix exponential is a loop of unknown length; use `diffrax.DirectAdjoint()`."
             )
-        controller = _controller(self.stepsize_controller, dtype, tolerance)
+        controller = _controller(self.stepsize_controller, dtype, tolerance, dict(rtol=rtol, atol=atol))
         return self._replace(solver=_implicit(solver, controller, adjoint), stepsize_controller=controller)
 
     def with_arrays(self, dtype: Any) -> "Integrator":
@@ -80,9 +88,29 @@ def _implicit(solver: Any, controller: Any, adjoint: Any) -> Any:
     )
 
 
-def _controller(controller: Any, dtype: Any, tolerance: tuple[float, float]) -> dfx.AbstractStepSizeController:
+def _with_tolerances(controller: Any, given: dict[str, Any], default: float) -> dfx.AbstractStepSizeController:
+    """The default controller with these tolerances."""
+    names = " and ".join(f"`{name}`" for name in given)
+    if controller is not None:
+        raise ValueError(
+            f"Argument `stepsize_controller` must not be given together with {names}, which set the tolerances of the "
+            f"default one. Drop {names}, or drop `stepsize_controller`."
+        )
+    for name, value in given.items():
+        numeric = eqx.is_array_like(value) and not isinstance(value, bool | complex)
+        if not numeric or jnp.ndim(value) != 0:
+            raise TypeError(f"Argument `{name}` must be a number, a tolerance such as 1e-8, but got {value!r}.")
+    return dfx.PIDController(rtol=given.get("rtol", default), atol=given.get("atol", default))
+
+
+def _controller(
+    controller: Any, dtype: Any, tolerance: tuple[float, float], given: dict[str, Any]
+) -> dfx.AbstractStepSizeController:
     eps = float(jnp.finfo(dtype).eps)
-    if controller is None:
+    given = {name: value for name, value in given.items() if value is not None}
+    if given:
+        controller = _with_tolerances(controller, given, tolerance[0] if eps < 1e-10 else tolerance[1])
+    elif controller is None:
         tol = tolerance[0] if eps < 1e-10 else tolerance[1]
         return dfx.PIDController(rtol=tol, atol=tol)
     if not isinstance(controller, dfx.AbstractStepSizeController):
@@ -92,11 +120,12 @@ def _controller(controller: Any, dtype: Any, tolerance: tuple[float, float]) -> 
         )
     values = {n: getattr(controller, n, None) for n in ("rtol", "atol")}
     values = {n: float(x) for n, x in values.items() if eqx.is_array_like(x) and not isinstance(x, Tracer)}
+    source = "Arguments `rtol` and `atol`" if given else "Argument `stepsize_controller`"
     for name, value in values.items():
         if not value >= 0:
-            raise ValueError(f"Argument `stepsize_controller` must have {name} >= 0, but got {name} = {value}.")
+            raise ValueError(f"{source} must have {name} >= 0, but got {name} = {value}.")
     if len(values) == 2 and not any(values.values()):
-        raise ValueError("Argument `stepsize_controller` must have a tolerance above zero, but rtol = atol = 0.")
+        raise ValueError(f"{source} must have a tolerance above zero, but rtol = atol = 0.")
     rtol = getattr(controller, "rtol", None)
     # A step of size one is rounded by about eps; its error estimate by a few times that. (Inside `jit` the
     # tolerance may have no value yet.)
@@ -109,7 +138,7 @@ def _controller(controller: Any, dtype: Any, tolerance: tuple[float, float]) -> 
             else "Loosen the tolerance."
         )
         raise ValueError(
-            f"Argument `stepsize_controller` must have a tolerance that {dtype} can hold (rtol >= {least:.1e}), but "
+            f"{source} must have a tolerance that {dtype} can hold (rtol >= {least:.1e}), but "
             f"got rtol = {float(rtol):.1e}. {cure}"
         )
     return controller

@@ -156,11 +156,17 @@ def _raise_if_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return _raise_if((tree, verdict)), _raise_if((moves, verdict)) if jax.tree.leaves(moves) else moves
 
 
+def result_names(result: RESULTS) -> np.ndarray:
+    """The name of each."""
+    names = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
+    codes = np.asarray(result._value)
+    return np.array([names[int(i)] for i in np.ravel(codes)], dtype=object).reshape(codes.shape)
+
+
 def outcomes(result: RESULTS) -> str:
     """`60 successful, 4 max_steps_reached`; of one alone its name."""
-    names = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
-    each = [names[int(i)] for i in np.ravel(result._value)]
-    return counted(each) if np.ndim(result._value) else each[0]
+    each = result_names(result)
+    return counted(each.ravel()) if each.ndim else str(each)
 
 
 def is_okay(result: RESULTS) -> Bool[Array, ""]:

@@ -1,5 +1,6 @@
 """What `solve` returns: saved states, the event log, dense output, and why it ended."""
 
+import os
 from collections.abc import Iterator
 from typing import Any, Generic, NamedTuple, overload
 
@@ -10,10 +11,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._compile import interactive
-from .._numerics._text import between, known, shown, written
+from .._numerics._tables import frame, lanes_of
+from .._numerics._text import between, components, known, shown, written
 from .._types import Scalar, StateT, Y
 from ..system._mode import change_words, mode_words
 from ..system._system import System
+from ._archive import Archive, save, table
+from ._dataset import dataset_of
 from ._results import is_okay, outcomes, RESULTS
 from .steppers._stepper import bernstein
 
@@ -99,6 +103,25 @@ class Events(eqx.Module, Generic[StateT]):
 
     def __iter__(self) -> Iterator[Event[StateT]]:
         return (self[i] for i in range(len(self)))
+
+    def to_dataframe(self) -> Any:
+        """A row for each event: `t`, the `switch`, the modes before and after (`mode_before.belt`), the states before
+        and after (`y_before.x`), and `transversality`. Of a batch the column `lane` says whose it is.
+
+        **Returns:** a `pandas.DataFrame`: `pip install nsjax[data]`.
+        """
+        log = jax.tree.map(np.asarray, self)
+        happened = np.arange(log.t.shape[-1]) < log.num[..., None]
+        columns = lanes_of(log.t.shape) + [("t", log.t.ravel())]
+        columns.append(("switch", np.array([*self.names, ""], dtype=object)[log.switch].ravel()))
+        for name in ("mode_before", "mode_after"):
+            rows = getattr(log, name)
+            columns += [(f"{name}.{switch}", rows[..., k].ravel()) for k, switch in enumerate(self.names)]
+        for name in ("y_before", "y_after"):
+            parts = components(getattr(log, name), log.t.ndim)
+            columns += [(f"{name}.{part}", values.ravel()) for part, values in parts.items()]
+        columns.append(("transversality", log.transversality.ravel()))
+        return frame("Events.to_dataframe", [(name, values[happened.ravel()]) for name, values in columns])
 
     def __str__(self) -> str:
         if jnp.ndim(self.num):
@@ -236,6 +259,36 @@ class Solution(eqx.Module, Generic[StateT]):
         short = eqx.tree_at(lambda e: e.num, rows, num, is_leaf=lambda x: x is None)
         return eqx.tree_at(lambda s: (s.events, s.result), self, (short, result))
 
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes the solution to a file, an `.npz` of plain arrays with a description in JSON; a batch of them too."""
+        save(path, "Solution", SAVED, self.system, self.y1, {"solution": self}, result=self.result)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike, system: System, y: StateT | None = None) -> "Solution[StateT]":
+        """Reads what `save` wrote. Nothing in the file is executed.
+
+        **Arguments:**
+
+        - `path`: the file.
+        - `system`: a model of the same class and shapes; the values of its parameters are taken from the file.
+        - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
+            NamedTuples. (The numbers do not matter, the shapes do.)
+
+        **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model.
+        """
+        return Archive(path, "Solution", SAVED, system, y).part("solution", result=RESULTS.successful)
+
+    def to_xarray(self) -> Any:
+        """The saved states over the dimension `time`, and the events over `event`.
+
+        Components of the state are variables by their names, those after events `x_after`, modes `mode_belt`; the time
+        of events is the coordinate `t_event`. Of a batch each has the dimension `lane` in front; rows that are there to
+        fill up are NaN, and in modes -128.
+
+        **Returns:** an `xarray.Dataset`: `pip install nsjax[data]`.
+        """
+        return dataset_of(self)
+
     @property
     def itinerary(self) -> Itinerary:
         """The modes it passes through."""
@@ -277,6 +330,9 @@ class Solution(eqx.Module, Generic[StateT]):
 
     def __call__(self, t: Any, left: bool = True) -> StateT:
         return self.evaluate(t, left)
+
+
+SAVED = table(Solution, Events)
 
 
 def _outside(s: Any, first: Any, last: Any) -> Any:

@@ -293,8 +293,8 @@ def _events(model: SwitchedSystem, c: Carry, start: ModeState) -> Events:
     )
 
 
-TOLERANCE = "Tolerances are those of the step size: `stepsize_controller=diffrax.PIDController(rtol=..., atol=...)`."
-HINTS = {name: TOLERANCE for name in ("rtol", "atol", "tol", "rtols", "tolerance")} | {
+TOLERANCE = "The tolerances of the step size are `rtol=..., atol=...`."
+HINTS = {name: TOLERANCE for name in ("tol", "rtols", "tolerance", "tolerances")} | {
     "args": "Parameters are fields of the system.",
     "event": "Surfaces are switches of the system: `@nsjax.sgn`, `@nsjax.relay`, `@nsjax.impact`.",
     "dense": "Write `saveat=diffrax.SaveAt(dense=True)`.",
@@ -314,6 +314,8 @@ def solve(
     mode: Mapping[str, Any] | Sequence[Any] | None = None,
     solver: dfx.AbstractSolver = dfx.Tsit5(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     saveat: dfx.SaveAt = dfx.SaveAt(t1=True),
     dt0: Any = None,
     max_steps: int = 4096,
@@ -333,7 +335,7 @@ def solve(
 
     - `system`: the model.
     - `t0`, `t1`: start and end [time].
-    - `y0`: the state at `t0`, any pytree of floating point arrays of one dtype.
+    - `y0`: the state at `t0`, any pytree of floating point arrays of one dtype. Integers become floating point numbers.
     - `mode`: for a start on a surface, `{"name": value}` or one value for each switch: `sgn` +1, -1, or 0 to slide
         (also on a repulsive surface); `relay` 0 or 1 (needed between its two surfaces, 0 by default); `impact` 0 or 1
         to rest. Where the solution is not unique this chooses one; without it static friction holds as long as it can,
@@ -341,6 +343,8 @@ def solve(
     - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, Euler,
         `nsjax.Taylor`, or for models that are affine in the state `nsjax.Exponential` or, for sweeps, `nsjax.Affine`.
     - `stepsize_controller`: by default `diffrax.PIDController` with `rtol = atol = 1e-8` (1e-5 for float32).
+    - `rtol`, `atol`: relative and absolute tolerance of that default controller, if not these; not to be given together
+        with `stepsize_controller`.
     - `saveat`: as in diffrax: `t0`, `t1`, `ts`, `steps`, `fn(t, y, system)`, `dense`.
     - `dt0`: first step; chosen automatically by default.
     - `max_steps`, `max_events`: bounds, also the capacity of dense output and of the event log.
@@ -360,7 +364,9 @@ def solve(
     t0, y0, given = checked_start(system, t0, y0, mode)
     t1 = checked_time("t1", t1, t0.dtype)
     check_span(system, t0, t1, saveat)
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint).checked(t0.dtype)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint).checked(
+        t0.dtype, rtol=rtol, atol=atol
+    )
     if throw:
         check_numbers(system, t0, t1, y0)
     system = arrays_of(system, t0.dtype)

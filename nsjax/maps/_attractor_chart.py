@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._numerics._text import between, counted, positive, shown
+from .._numerics._progress import Counting, ProgressMeter, QUIET
+from .._numerics._tables import frame
+from .._numerics._text import between, components, counted, positive, shown
 from .._types import Y
 from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
@@ -60,6 +62,19 @@ class AttractorChart(eqx.Module):
     ys: Y
     result: Int[np.ndarray, "first second"]
 
+    def to_dataframe(self) -> Any:
+        """A row for each solution: the two parameters by their names, what it settled on as a word (`attractor`), the
+        `period`, the `itinerary` in words, `exponent`, `error`, `iterates`, and the components of the state at the end.
+
+        **Returns:** a `pandas.DataFrame`: `pip install nsjax[data]`.
+        """
+        words = np.array([*self.itineraries, ""], dtype=object)  # -1 is the last
+        columns = dict(zip(self.parameters, np.meshgrid(*self.values, indexing="ij")))
+        columns |= dict(attractor=self.kinds(), period=self.periods, itinerary=words[self.classes])
+        columns |= dict(exponent=self.exponents, error=self.errors, iterates=self.iterates)
+        rows = [*columns.items(), *components(self.ys, 2).items()]
+        return frame("AttractorChart.to_dataframe", [(name, np.ravel(x)) for name, x in rows])
+
     @property
     def failed(self) -> Bool[np.ndarray, "first second"]:
         """Where the solution failed; `result` says why."""
@@ -104,11 +119,14 @@ def attractor_chart(
     t0: Any = 0.0,
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     max_steps: int = 4096,
     max_events: int = 256,
     chunk: int | None = None,
     devices: Devices | None = None,
     path: str | os.PathLike | None = None,
+    progress_meter: ProgressMeter = QUIET,
 ) -> AttractorChart:
     """On what solutions settle, over two parameters: the period of the attractor, its itinerary, or chaos.
 
@@ -132,15 +150,18 @@ def attractor_chart(
         each, vectors [unit of the parameter].
     - `start`: the state at `t0` from which all solutions set out.
     - `tol`: points of an attractor that are nearer to each other than this, in each component of the state, are one.
-    - `max_iterates`: after how many iterates to give up; it is rounded up to a multiple of `4 * max_period`.
+    - `max_iterates`: after how many iterates to give up; it is rounded up to a multiple of `4 * max_period` (of an
+        odd `max_period`, of 4 more).
     - `max_period`: the longest period that is looked for, in iterates.
     - `section`, `direction`, `max_time`: as for `poincare_map`; by default an iterate is a period of the forcing.
     - `interval`: instead of these, for an autonomous system whose solutions come to rest: how often to look [time].
     - `t0`: the phase of the forcing [time].
-    - `solver`, `stepsize_controller`: as for `solve`. `max_steps`, `max_events`: for each iterate.
+    - `solver`, `stepsize_controller`, `rtol`, `atol`: as for `solve`. `max_steps`, `max_events`: for each iterate.
     - `chunk`, `devices`: how many solutions go together, and on which devices, see `sweep`.
     - `path`: a folder that keeps what is done, a chunk at a time, and from which a call that was interrupted goes on,
         with a larger `max_iterates` too. See `Sweep`.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how many solutions are done,
+        how many in a second, and how long the others will take; see `sweep`.
 
     **Returns:** an `AttractorChart`.
 
@@ -158,7 +179,7 @@ def attractor_chart(
     if paths[0] == paths[1]:
         raise ValueError(f"Argument `parameters` must name two parameters, but {names[0]!r} and {names[1]!r} are one.")
     t0, start, _ = checked_start(system, t0, start, None)
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, rtol=rtol, atol=atol)
     system = arrays_of(system, t0.dtype)
     values = [np.asarray(parameters[name], t0.dtype) for name in names]
     for name, value in zip(names, values):
@@ -171,9 +192,11 @@ def attractor_chart(
         chunk = default_chunk(min(shape[0] * shape[1], 65536), devices_of(devices)[0].platform)
     positive("chunk", chunk)
     _, chunk = even_chunks(shape[0] * shape[1], chunk)
-    window = Window(system, paths, step, t0, start, 4 * max_period, jnp.asarray(tol, t0.dtype))
+    ahead = 8 * -(-max_period // 2)  # in eight parts of one length, by which exponents have their errors
+    window = Window(system, paths, step, t0, start, ahead, jnp.asarray(tol, t0.dtype))
     pairs = np.stack([a.ravel() for a in np.meshgrid(*values, indexing="ij")], axis=-1)
-    found = Pursuit(window, pairs, chunk, devices, path).followed(-(-max_iterates // window.iterates))
+    with Counting(progress_meter, len(pairs), "solutions") as counting:
+        found = Pursuit(window, pairs, chunk, devices, path, counting).followed(-(-max_iterates // window.iterates))
     grid = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), found.lanes)
     ys = jax.vmap(jax.vmap(jfu.ravel_pytree(start)[1]))(grid.x)
     return AttractorChart(

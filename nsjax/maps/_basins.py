@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._numerics._progress import Counting, ProgressMeter, QUIET
 from .._numerics._text import positive, shown
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start
@@ -105,10 +106,15 @@ class _Search:
     most: int  # iterates
     size: int  # of a batch: another would be another program
     finds: bool  # whether attractors are added
+    progress_meter: ProgressMeter = QUIET
     known: list[np.ndarray] = dataclasses.field(default_factory=list)
 
-    def follow(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Labels, iterates and results of starts of shape `(lanes, n)`."""
+    def follow(self, x: np.ndarray, what: str = "starts") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Labels, iterates and results of starts of shape `(lanes, n)`; `what` they are called."""
+        with Counting(self.progress_meter, len(x), what) as counting:
+            return self._followed(x, counting)
+
+    def _followed(self, x: np.ndarray, counting: Counting) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         labels, counts = np.full(len(x), UNDECIDED), np.zeros(len(x), int)
         results = np.zeros(len(x), int)
         parts = []  # solutions on their way, in batches of one size
@@ -128,6 +134,7 @@ class _Search:
                     else:
                         labels[row] = self._label(seen[lane])
                     counts[row] = done
+                counting.at(int(np.sum(labels != UNDECIDED)))
                 going = labels[rows] == UNDECIDED
                 if going.any():
                     later.append((rows[going], *_taken((here, seen), np.flatnonzero(going))))
@@ -172,7 +179,7 @@ class _Search:
 
     def add(self, x: np.ndarray) -> None:
         """The attractors to which states lead, in this order."""
-        finding = dataclasses.replace(self, finds=True)  # of the same list
+        finding = dataclasses.replace(self, finds=True, progress_meter=QUIET)  # of the same list
         for k, row in enumerate(x):
             label = finding.follow(row[None])[0][0]
             if label < 0:
@@ -208,8 +215,11 @@ def basins(
     t0: Any = 0.0,
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     max_steps: int = 4096,
     max_events: int = 256,
+    progress_meter: ProgressMeter = QUIET,
 ) -> Basins:
     """To which attractor each of many starts leads.
 
@@ -236,7 +246,9 @@ def basins(
     - `section`, `direction`, `max_time`: as for `poincare_map`, for an autonomous system with periodic orbits; a forced
         one is looked at once in each period, at the phase of `t0` [time].
     - `interval`: instead of these, for an autonomous system whose solutions come to rest: how often to look [time].
-    - `solver`, `stepsize_controller`: as for `solve`. `max_steps`, `max_events`: for each iterate.
+    - `solver`, `stepsize_controller`, `rtol`, `atol`: as for `solve`. `max_steps`, `max_events`: for each iterate.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how many starts are decided,
+        how many in a second, and how long the others will take; a function is called with that.
 
     **Returns:** `Basins`.
 
@@ -251,11 +263,12 @@ def basins(
     if refine and len(shape) != 2:
         raise ValueError(f"Argument `refine` is for grids with two axes, but `starts` have {len(shape)}.")
     t0, like, _ = checked_start(system, t0, jax.tree.map(lambda x: jnp.ravel(x)[0], starts), None)
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, rtol=rtol, atol=atol)
     system = arrays_of(system, t0.dtype)
     step = map_of(system, section, (direction, max_time), interval, (t0, like), integrator)
     lanes = _Lanes(step, system, t0, like, min(8, max_iterates))
-    search = _Search(lanes, float(tol), max_iterates, FEW if np.prod(shape) <= FEW else CHUNK, attractors is None)
+    size = FEW if np.prod(shape) <= FEW else CHUNK
+    search = _Search(lanes, float(tol), max_iterates, size, attractors is None, progress_meter)
     if attractors is not None:
         given = [_state_of(k, a, system, t0) for k, a in enumerate(attractors)]
         search.add(np.stack([np.asarray(jfu.ravel_pytree(y)[0], t0.dtype) for y in given]))
@@ -302,7 +315,7 @@ def _finer(search: _Search, x: np.ndarray, *found: np.ndarray) -> tuple[np.ndarr
     for a, old in zip(new, found):
         a[::2, ::2] = old
     while (ask := (new[1] == 0) & _beside_another(label)).any():
-        for a, value in zip(new, search.follow(fine[ask])):
+        for a, value in zip(new, search.follow(fine[ask], "points of the finer grid")):
             a[ask] = value
     return fine, *new
 

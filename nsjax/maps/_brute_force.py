@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._numerics._text import between, positive, shown, written
+from .._numerics._progress import ProgressMeter, QUIET
+from .._numerics._tables import frame
+from .._numerics._text import between, components, positive, shown, written
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
-from ..flow._results import outcomes, RESULTS
+from ..flow._results import outcomes, result_names, RESULTS
 from ..orbits._orbit import ravel
 from ..sweeps._devices import Devices
 from ..sweeps._long_sweep import sweep_in
@@ -54,6 +56,20 @@ class BruteForce(eqx.Module):
             f"  points  {written(self.ys, self.ts.ndim)}\n"
             f"  result  {outcomes(self.result)}"
         )
+
+    def to_dataframe(self) -> Any:
+        """A row for each point: the parameter by its name, `start`, `point`, `t`, the components of the state, and the
+        `result` of its solution.
+
+        **Returns:** a `pandas.DataFrame`: `pip install nsjax[data]`.
+        """
+        shape = self.ts.shape
+        _, start, point = np.indices(shape)
+        values = np.broadcast_to(np.asarray(self.values)[:, None, None], shape)
+        result = np.broadcast_to(result_names(self.result)[:, :, None], shape)
+        columns = {self.parameter: values, "start": start, "point": point, "t": np.asarray(self.ts)}
+        rows = [*columns.items(), *components(self.ys, 3).items(), ("result", result)]
+        return frame("BruteForce.to_dataframe", [(name, x.ravel()) for name, x in rows])
 
     def periods(self, tol: float = 1e-4) -> np.ndarray:
         """After how many points each solution repeats itself: 0 where it does not within half of those kept, as in
@@ -127,11 +143,14 @@ def brute_force(
     t0: Any = 0.0,
     solver: dfx.AbstractSolver = dfx.Tsit5(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     max_steps: int = 4096,
     max_events: int = 256,
     chunk: int | None = None,
     devices: Devices | None = None,
     path: str | os.PathLike | None = None,
+    progress_meter: ProgressMeter = QUIET,
 ) -> BruteForce:
     """A brute-force bifurcation diagram: for each value of a parameter, the points at which solutions pierce a Poincaré
     section after a transient.
@@ -156,10 +175,12 @@ def brute_force(
     - `carry`: whether each value begins where the solution for the one before it ended, in the order of `values`, which
         follows a branch to where it ends: with `values` rising and falling it shows hysteresis. `starts` are for the
         first. By default every value has all of them.
-    - `solver`, `stepsize_controller`: as for `solve`. `max_steps`, `max_events`: for each point.
+    - `solver`, `stepsize_controller`, `rtol`, `atol`: as for `solve`. `max_steps`, `max_events`: for each point.
     - `chunk`, `devices`: how many solutions go together, and on which devices, see `sweep`.
     - `path`: a folder that keeps what is done, a chunk of solutions at a time, and from which a call that was
         interrupted goes on; see `Sweep`.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how many lanes are done, how
+        many in a second, and how long the others will take; see `sweep`.
 
     **Returns:** a `BruteForce`. Solutions that fail, or return no more, have a `result` that says why.
 
@@ -177,7 +198,7 @@ def brute_force(
         )
     one = jax.tree.map(lambda x: x[0], starts)
     t0, y0, _ = checked_start(system, t0, one, None)
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, rtol=rtol, atol=atol)
     place = parameter_path(system, parameter)
     system = arrays_of(system, t0.dtype)
     values = jnp.asarray(values, t0.dtype)
@@ -191,10 +212,18 @@ def brute_force(
     number = len(jax.tree.leaves(starts)[0])
     args = (system, place, step, t0, values, transient, keep)
     if carry:
-        found = sweep_in(path, _Carried(*args), starts, chunk=chunk, devices=devices)
+        found = sweep_in(path, _Carried(*args), starts, chunk=chunk, devices=devices, progress_meter=progress_meter)
         found = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), found)
     else:
         each = jax.tree.map(lambda x: jnp.tile(x, (len(values),) + (1,) * (x.ndim - 1)), starts)
-        found = sweep_in(path, _Apart(*args), jnp.repeat(values, number), each, chunk=chunk, devices=devices)
+        found = sweep_in(
+            path,
+            _Apart(*args),
+            jnp.repeat(values, number),
+            each,
+            chunk=chunk,
+            devices=devices,
+            progress_meter=progress_meter,
+        )
         found = jax.tree.map(lambda x: x.reshape(len(values), number, *x.shape[1:]), found)
     return BruteForce(parameter, values, *found)

@@ -220,6 +220,8 @@ def lyapunov_spectrum(
     mode: Any = None,
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     max_steps: int = 4096,
     max_events: int = 256,
     throw: bool = True,
@@ -249,7 +251,7 @@ def lyapunov_spectrum(
         rounding tells (a factor of 1e13 in float64) counts as forgotten.
     - `divergence`: whether to compute the mean growth of volumes by another way, as a check.
     - `t0`: the phase of the forcing [time].
-    - `mode`, `solver`, `stepsize_controller`: as for `solve`. `max_steps`, `max_events`: for each part.
+    - `mode`, `solver`, `stepsize_controller`, `rtol`, `atol`: as for `solve`. `max_steps`, `max_events`: for each part.
     - `throw`: whether a failure raises; if not, look at `LyapunovSpectrum.result`.
 
     **Returns:** a `LyapunovSpectrum`.
@@ -267,7 +269,7 @@ def lyapunov_spectrum(
         raise ValueError(f"Argument `exponents` must be at most {size}, the components of the state, but got {number}.")
     if divergence and number < size:
         raise ValueError("`divergence=True` needs all exponents: leave out `exponents=`.")
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, rtol=rtol, atol=atol)
     system = arrays_of(system, t0.dtype)
     step = _step(system, interval, t0, integrator)
     # No direction of the coordinates: one of these may never turn into that of the largest exponent.

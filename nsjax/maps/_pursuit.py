@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._numerics._progress import Counting
 from .._types import Scalar, Y
 from ..flow._results import is_okay, RESULTS
 from ..flow._solution import Events
@@ -177,6 +178,7 @@ class Pursuit(NamedTuple):
     chunk: int
     devices: Devices | None
     path: str | os.PathLike | None
+    counting: Counting
 
     def followed(self, rounds: int) -> Found:
         left, here = np.arange(len(self.values)), self._start()
@@ -184,9 +186,11 @@ class Pursuit(NamedTuple):
         late: list[tuple[np.ndarray, np.ndarray]] = []  # growth and times in the second half
         for k in range(rounds):
             folder = None if self.path is None else os.path.join(self.path, f"{k:04d}")
+            self._tell(k, len(left), 0)
             seen: Seen = sweep_again(
-                folder, self.window, self.values[left], here, chunk=self.chunk, devices=self.devices
-            )
+                folder, self.window, self.values[left], here, chunk=self.chunk, devices=self.devices,
+                tell=lambda done, k=k, left=left: self._tell(k, len(left), done),
+            )  # fmt: skip
             good, codes = np.asarray(is_okay(seen.result)), seen.result._value
             done = ~good | (seen.period > 0)
             out.iterates[left] = (k + 1) * self.window.iterates
@@ -208,6 +212,11 @@ class Pursuit(NamedTuple):
             out.errors[left] = np.where(np.isfinite(mean), np.asarray(standard_errors(jnp.asarray(rates))), np.nan)
             out.chaotic[left] = mean > SIGMAS * out.errors[left]
         return self._sorted(out, classes)
+
+    def _tell(self, k: int, left: int, done: int) -> None:
+        """Only those that have settled count: how often the others are to be gone on with, nobody knows."""
+        stage = f"{done:,} of {left:,} followed to iterate {(k + 1) * self.window.iterates:,}"
+        self.counting.at(len(self.values) - left, stage)
 
     def _start(self) -> Here:
         window, lanes = self.window, len(self.values)

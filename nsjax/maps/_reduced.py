@@ -70,8 +70,10 @@ def reduced_map(
     mode: Any = None,
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     tol: float | None = None,
-    max_iterations: int = 30,
+    max_newton_steps: int = 30,
     max_steps: int = 4096,
     max_events: int = 64,
     throw: bool = True,
@@ -101,9 +103,9 @@ def reduced_map(
     - `guess`: a state with which Newton's method begins; its `component` is not used.
     - `order`: after how many periods of the forcing the others are the same.
     - `t0`: the phase of the forcing [time].
-    - `tol`, `max_iterations`: of Newton's method, by default 1e-10 (float32: 1e-4) and 30.
-    - `mode`, `solver`, `stepsize_controller`, `max_steps`, `max_events`: as for `solve`; by default Dopri8 with
-        tolerances of 1e-12 (float32: 1e-6).
+    - `tol`, `max_newton_steps`: of Newton's method, by default 1e-10 (float32: 1e-4) and 30.
+    - `mode`, `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`, `max_events`: as for `solve`; by default
+        Dopri8 with tolerances of 1e-12 (float32: 1e-6).
     - `throw`: whether a failure raises; if not, look at `ReducedIterate.result`.
 
     **Returns:** a `ReducedIterate`.
@@ -112,7 +114,9 @@ def reduced_map(
     found.
     """
     t0, y0, given = checked_start(system, t0, guess, mode)
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, (1e-12, 1e-6))
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(
+        t0.dtype, (1e-12, 1e-6), rtol=rtol, atol=atol
+    )
     tol = (1e-10 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4) if tol is None else tol
     x = jnp.asarray(x, t0.dtype)
     if x.shape != ():
@@ -120,7 +124,7 @@ def reduced_map(
     phase_map(system, order, integrator)
     system = arrays_of(system, t0.dtype)
     span = _Span(given or None, order, integrator)
-    out = _reduced((system, t0, x), y0, _place(y0, component), span, Newton(tol, max_iterations))
+    out = _reduced((system, t0, x), y0, _place(y0, component), span, Newton(tol, max_newton_steps))
     return raise_if(~is_okay(out.result), out.result, out) if throw else out
 
 

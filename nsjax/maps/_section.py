@@ -197,6 +197,8 @@ def poincare_map(
     mode: Any = None,
     solver: dfx.AbstractSolver = dfx.Tsit5(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     max_steps: int = 4096,
     max_events: int = 256,
     max_time: Any = None,
@@ -230,8 +232,8 @@ def poincare_map(
         that side, and 0 for all of its events; of a relay 1 where it switches on, -1 off; of an impact 1 or 0.
     - `number`: which crossing, counted from 1: that power of the map.
     - `iterates`: how many iterates, which then have a leading axis; by default one, without.
-    - `t0`, `mode`, `solver`, `stepsize_controller`, `max_events`, `adjoint`: as for `solve`. `max_steps`: for each
-        return.
+    - `t0`, `mode`, `solver`, `stepsize_controller`, `rtol`, `atol`, `max_events`, `adjoint`: as for `solve`.
+        `max_steps`: for each return.
     - `max_time`: how long each return may take [time]; forced systems: by default a hundred periods.
     - `throw`: whether a failure raises; if not, look at `Iterate.result`, which has one entry a lane under `vmap`.
 
@@ -245,6 +247,8 @@ def poincare_map(
     integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint)
 
     def make(system: System, t: Scalar, y: Y) -> PoincareMap:
-        return section_map(system, section, direction, max_time, t, y, integrator.checked(t.dtype))
+        return section_map(
+            system, section, direction, max_time, t, y, integrator.checked(t.dtype, rtol=rtol, atol=atol)
+        )
 
     return iterated(make, system, (t0, y0, mode), iterates, number, throw)

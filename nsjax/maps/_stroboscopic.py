@@ -61,6 +61,8 @@ def stroboscopic_map(
     mode: Any = None,
     solver: dfx.AbstractSolver = dfx.Tsit5(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     max_steps: int = 4096,
     max_events: int = 256,
     adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
@@ -77,7 +79,8 @@ def stroboscopic_map(
     - `order`: over how many periods of the forcing.
     - `iterates`: how many iterates, which then have a leading axis; by default one, without.
     - `t0`: the phase of the forcing [time].
-    - `mode`, `solver`, `stepsize_controller`, `adjoint`: as for `solve`. `max_steps`, `max_events`: for each iterate.
+    - `mode`, `solver`, `stepsize_controller`, `rtol`, `atol`, `adjoint`: as for `solve`. `max_steps`, `max_events`: for
+        each iterate.
     - `throw`: whether a failure raises; if not, look at `Iterate.result`.
 
     **Returns:** an `Iterate`.
@@ -87,6 +90,6 @@ def stroboscopic_map(
     integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint)
 
     def make(system: System, t: Scalar, y: Y) -> PoincareMap:
-        return phase_map(system, order, integrator.checked(t.dtype))
+        return phase_map(system, order, integrator.checked(t.dtype, rtol=rtol, atol=atol))
 
     return iterated(make, system, (t0, y0, mode), iterates, 1, throw)

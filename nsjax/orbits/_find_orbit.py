@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._numerics._autodiff import dense_jacobian, forward_only
+from .._numerics._progress import ProgressMeter, QUIET
 from .._numerics._root import Newton
 from .._numerics._text import known, suggesting, written
 from .._types import Scalar, StateT, Y
@@ -31,7 +32,7 @@ def _inversion(y: Y) -> Y:
     return jax.tree.map(jnp.negative, y)
 
 
-@suggesting(HINTS | {"T": "Write `period=...`."})
+@suggesting(HINTS | {"T": "Write `period=...`.", "max_iterations": "Write `max_newton_steps=...`."})
 def find_orbit(
     system: System,
     y0: StateT,
@@ -47,8 +48,10 @@ def find_orbit(
     pieces: int = 1,
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     tol: float | None = None,
-    max_iterations: int = 30,
+    max_newton_steps: int = 30,
     max_steps: int = 4096,
     max_events: int = 64,
     adjoint: dfx.AbstractAdjoint = dfx.ForwardMode(),
@@ -91,9 +94,10 @@ def find_orbit(
         begins, and so is in the same mode. `y0` lies on no surface.
     - `pieces`: into how many pieces of equal length each segment is divided: multiple shooting, for orbits so unstable
         that no single solution follows them.
-    - `solver`, `stepsize_controller`, `max_steps`, `max_events`: as for `solve`; by default Dopri8 with tolerances of
-        1e-12 (float32: 1e-6).
-    - `tol`: tolerance of Newton's method, by default 1e-10 (float32: 1e-4).
+    - `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`, `max_events`: as for `solve`; by default Dopri8 with
+        tolerances of 1e-12 (float32: 1e-6).
+    - `tol`, `max_newton_steps`: of Newton's method, by default 1e-10 (float32: 1e-4) and 30. (`max_steps` are those of
+        each solution.)
     - `adjoint`: `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`; for `jax.grad` and `jax.linearize` (and so for
         optimistix's optimisers) `diffrax.DirectAdjoint()`, at the cost of a forward derivative for each parameter that
         is perturbed.
@@ -108,7 +112,9 @@ def find_orbit(
     orbit, or nowhere.
     """
     t0, y0, given = checked_start(system, t0, y0, mode)
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, (1e-12, 1e-6))
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(
+        t0.dtype, (1e-12, 1e-6), rtol=rtol, atol=atol
+    )
     tol = (1e-10 if jnp.finfo(t0.dtype).eps < 1e-10 else 1e-4) if tol is None else tol
     symmetry = _inversion if symmetry == "inversion" else symmetry
     _check_method(method, symmetry, backward, segments, pieces, adjoint)
@@ -129,7 +135,7 @@ def find_orbit(
         pieces=pieces,
         concrete=concrete,
         integrator=integrator,
-        newton=Newton(tol, max_iterations),
+        newton=Newton(tol, max_newton_steps),
     )
     if isinstance(adjoint, dfx.DirectAdjoint) and not concrete:
         orbit = dense_jacobian(search.run, system, y0, period)
@@ -194,6 +200,7 @@ def find_orbits(
     order: int = 1,
     devices: Devices | None = None,
     path: str | os.PathLike | None = None,
+    progress_meter: ProgressMeter = QUIET,
     **options: Any,
 ) -> list[Orbit[StateT]]:
     """The different periodic orbits that `find_orbit` finds from many starting points, unstable ones included.
@@ -208,6 +215,8 @@ def find_orbits(
     - `devices`: on which devices, see `sweep`.
     - `path`: a folder that keeps what was found, 256 starts at a time, and from which a search that was interrupted
         goes on; see `Sweep`.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how many lanes are done, how
+        many in a second, and how long the others will take; see `sweep`.
 
     **Returns:** the orbits, those to which most starts led first; an empty list if there are none. Subharmonics that
     differ by periods of the forcing only are one orbit.
@@ -221,7 +230,7 @@ def find_orbits(
     def one(start: tuple[Y, Any]) -> Orbit:
         return find_orbit(system, start[0], period=start[1], order=order, throw=False, **options)
 
-    batch = sweep_in(path, one, (starts, guesses), devices=devices)
+    batch = sweep_in(path, one, (starts, guesses), devices=devices, progress_meter=progress_meter)
     arrays, static = eqx.partition(batch, eqx.is_array)
     good = np.flatnonzero(np.asarray(is_okay(batch.result)))
     return distinct_orbits([eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static) for i in good], order)

@@ -1,5 +1,7 @@
 """A periodic orbit, with its Floquet multipliers."""
 
+import dataclasses
+import os
 from collections.abc import Callable
 from typing import Any, Generic
 
@@ -14,6 +16,7 @@ from .._numerics._text import between, listed, shown
 from .._types import Number, Scalar, StateT, Y
 from ..derivatives._floquet import trivial
 from ..derivatives._saltation import saltation_matrices
+from ..flow._archive import Archive, plain, save, table
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, outcomes, RESULTS
 from ..flow._solution import Events, Itinerary, Solution
@@ -141,10 +144,56 @@ class Orbit(eqx.Module, Generic[StateT]):
         It leaves an orbit that is infinitely unstable at the surface that repels: see `path`.
         """
         end = self.t0 + periods * self.period
+        how = self.integrator.arguments
+        if kwargs.keys() & {"rtol", "atol"}:
+            how = how | dict(stepsize_controller=None)
         mode = tuple(self.mode) if self.events.names else None
-        return solve(
-            self.system, self.t0, end, self.y0, mode=mode, saveat=saveat, **(self.integrator.arguments | kwargs)
+        return solve(self.system, self.t0, end, self.y0, mode=mode, saveat=saveat, **(how | kwargs))
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes the orbit to a file, an `.npz` of plain arrays with a description in JSON; a batch of them too."""
+        parts = dict(orbit=self, integrator=plain(repr(self.integrator)))
+        save(path, "Orbit", SAVED, self.system, self.y0, parts, (Integrator,), result=self.result)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | os.PathLike,
+        system: System,
+        y: StateT | None = None,
+        *,
+        solver: dfx.AbstractSolver = dfx.Dopri8(),
+        stepsize_controller: dfx.AbstractStepSizeController | None = None,
+        rtol: float | None = None,
+        atol: float | None = None,
+        max_steps: int = 4096,
+        max_events: int = 64,
+    ) -> "Orbit[StateT]":
+        """Reads what `save` wrote. Nothing in the file is executed.
+
+        **Arguments:**
+
+        - `path`: the file.
+        - `system`: a model of the same class and shapes; the values of its parameters are taken from the file.
+        - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
+            NamedTuples. (The numbers do not matter, the shapes do.)
+        - `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`, `max_events`: those with which the orbit was
+            found: by them it is followed, as by `path` and `solve`.
+
+        **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model or
+        solver.
+        """
+        archive = Archive(path, "Orbit", SAVED, system, y)
+        orbit = archive.part("orbit", result=RESULTS.successful)
+        integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(
+            orbit.t0.dtype, (1e-12, 1e-6), rtol=rtol, atol=atol
         )
+        if plain(repr(integrator)) != archive.part("integrator"):
+            raise ValueError(
+                "Arguments `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps` and `max_events` must be those "
+                f"with which the orbit was found, {archive.part('integrator')}, but are {plain(repr(integrator))}."
+            )
+        return dataclasses.replace(orbit, integrator=integrator)
 
     def __str__(self) -> str:
         if jnp.ndim(self.period):
@@ -168,6 +217,9 @@ class Orbit(eqx.Module, Generic[StateT]):
         if not self.admissible:
             text += f"\n  leaves its modes by {float(self.violation):.3g} at t = {float(self.violation_t):.6g}"
         return text
+
+
+SAVED = table(Orbit, Events, Arcs)
 
 
 def ravel(y: Y) -> Array:

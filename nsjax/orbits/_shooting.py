@@ -154,7 +154,7 @@ def _search(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scala
         base = y0, period, (mode or {}) | (relays_at(system, t0, y0, mode) or {}) or None
         base = look(_unknowns(y0, period, True), LAPS, unsure).base
     z, converged = _unknowns(*base[:2], system.period is None), unsure
-    for _ in range(shooting.newton.max_iterations):
+    for _ in range(shooting.newton.max_steps):
         z, ended, converged = look(z, shooting.part, unsure).step
         if ended:
             break

@@ -7,6 +7,7 @@ from ._attractor_chart import attractor_chart as attractor_chart
 from ._basins import basins as basins
 from ._branch import bifurcation_diagram as bifurcation_diagram
 from ._eigenvalues import eigenvalue_path as eigenvalue_path
+from ._explore import explore as explore, Explorer as Explorer
 from ._matrix import fundamental_matrix as fundamental_matrix, multipliers as multipliers
 from ._orbit_branch import (
     multiplier_circle as multiplier_circle,

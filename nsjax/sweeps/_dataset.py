@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from .._numerics._tables import frame, package
 from ._lanes import Lanes
 from ._outcomes import Item
 
@@ -27,22 +28,40 @@ def argument_names(fn: Callable[..., Any], count: int) -> list[str]:
 
 
 def dataset(fn: Callable[..., Any], lanes: Lanes, result: Any) -> Any:
-    try:
-        import xarray
-    except ImportError as error:
-        raise ImportError("`Sweep.to_xarray` needs the package xarray: `pip install nsjax[data]`.") from error
-    coordinates: dict[str, Any] = {}
+    xarray = package("xarray", "Sweep.to_xarray")
+    arguments, results = _named(fn, lanes, result)
+    return xarray.Dataset(
+        {name: (_dimensions(name, leaf), leaf, _attributes(kind)) for name, (leaf, kind) in results.items()},
+        {name: (_dimensions(name, leaf), leaf) for name, leaf in arguments.items()},
+    )
+
+
+def dataframe(fn: Callable[..., Any], lanes: Lanes, result: Any) -> Any:
+    arguments, results = _named(fn, lanes, result)
+    told = {name: leaf if kind is None else _words(leaf, kind) for name, (leaf, kind) in results.items()}
+    return frame("Sweep.to_dataframe", (arguments | told).items())
+
+
+def _named(
+    fn: Callable[..., Any], lanes: Lanes, result: Any
+) -> tuple[dict[str, np.ndarray], dict[str, tuple[np.ndarray, Any]]]:
+    """Arguments, and what was returned, by name; of the latter which enumeration it is of, if of one."""
+    arguments: dict[str, Any] = {}
     for name, value in zip(argument_names(fn, len(lanes.mapped)), lanes.mapped):
         for own, leaf in zip(leaf_names(value, ""), jax.tree.leaves(value)):
-            full = f"{name}.{own}".rstrip(".")
-            coordinates[full] = (_dimensions(full, leaf), leaf)
-    variables = {}
+            arguments[f"{name}.{own}".rstrip(".")] = leaf
+    results = {}
     items = jax.tree.leaves(result, is_leaf=lambda x: isinstance(x, Item))
     kinds = {id(x._value): x._enumeration for x in items if isinstance(x, Item)}
     for name, leaf in zip(leaf_names(result, "value"), jax.tree.leaves(result)):
-        name = f"{name}_" if name in coordinates else name  # that of an argument is taken
-        variables[name] = (_dimensions(name, leaf), leaf, _attributes(kinds.get(id(leaf))))
-    return xarray.Dataset(variables, coordinates)
+        name = f"{name}_" if name in arguments else name  # that of an argument is taken
+        results[name] = leaf, kinds.get(id(leaf))
+    return arguments, results
+
+
+def _words(codes: np.ndarray, kind: Any) -> np.ndarray:
+    names = {int(item._value): name for name, item in kind._name_to_item.items()}
+    return np.array([names[int(i)] for i in codes.ravel()], dtype=object).reshape(codes.shape)
 
 
 def _dimensions(name: str, leaf: Any) -> list[str]:

@@ -11,16 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._numerics._compile import eager, on_host
+from .._numerics._progress import ProgressMeter, QUIET, Told
 from .._numerics._text import known, positive, shown
 from ._claim import Claims, myself
-from ._dataset import dataset, leaf_names
+from ._dataset import dataframe, dataset, leaf_names
 from ._devices import DeviceQueue, Devices, devices_of
 from ._fingerprint import differences, fingerprint
 from ._folder import Folder
 from ._lanes import CHUNK, default_chunk, lanes_of
 from ._outcomes import Outcome, outcome_of
 from ._piece import MOST, Piece
-from ._progress import Meter, Progress, Status
+from ._progress import Meter, Status
 from ._sweep import in_pieces, sweep
 from ._work import Work
 
@@ -47,7 +48,8 @@ class Sweep:
         sol = nsjax.solve(StickSlip(v_dr=v_dr), 0.0, 100.0, State(2.5, 0.0), throw=False)
         return sol.y1, sol.result
 
-    runs = nsjax.Sweep(final, np.linspace(0.1, 1.0, 10_000_000), path="run/", progress=True)
+    meter = diffrax.TextProgressMeter()
+    runs = nsjax.Sweep(final, np.linspace(0.1, 1.0, 10_000_000), path="run/", progress_meter=meter)
     y1, _ = runs.run().result()  # y1.x has shape (10_000_000,), and is on the disk
     print(runs.counts())
     ```
@@ -72,8 +74,9 @@ class Sweep:
         how long each takes, or a parameter that tells. Lanes of a chunk wait for the slowest of them, so that this pays
         where neighbours are not alike, as in a random sample (`benchmarks/sweep_scale.py`). What is returned is in its
         own order, and does not depend on it.
-    - `progress`: whether to write to the standard error stream how far it is, how many lanes it does in a second and
-        how long it will take; or a function, which is given a `Status` after each block.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how far it is, how many lanes
+        it does in a second and how long it will take; `diffrax.TqdmProgressMeter()` draws a bar; a function is given a
+        `Status` after each block.
     - `stale`: for how long a block is left to another process that gives no sign of life [s]. (Of a process on the same
         machine it is known at once that it is no more.)
 
@@ -91,12 +94,13 @@ class Sweep:
         chunk: int | None = None,
         devices: Devices | None = None,
         order: Any = None,
-        progress: Progress = False,
+        progress_meter: ProgressMeter = QUIET,
         stale: float = 120.0,
     ):
         if not (eager() and known((fn, args))):
             raise ValueError("`nsjax.Sweep` is not for `jax.jit`, `jax.vmap` and derivatives: use `nsjax.sweep`.")
         positive("block", block)
+        Told(progress_meter)  # which is checked before anything is compiled
         self._devices = devices_of(devices)
         if chunk is None:
             chunk = min(block, default_chunk(block, self._devices[0].platform))
@@ -109,7 +113,7 @@ class Sweep:
         if order is not None and np.shape(order) != (lanes.number,):
             raise ValueError(f"Argument `order` must have shape ({lanes.number},), but has {np.shape(order)}.")
         self._order = order if order is None or isinstance(order, np.ndarray) else np.asarray(order)
-        self._fn, self._progress, self._stale = fn, progress, stale
+        self._fn, self._progress_meter, self._stale = fn, progress_meter, stale
         self._block, self._number = block, -(-lanes.number // block)
         chunk = max(1, min(chunk, lanes.number))  # of few lanes there are no more in a chunk
         chunks = -(-min(block, max(1, lanes.number)) // chunk)
@@ -183,7 +187,7 @@ class Sweep:
         yield from sorted(done)
         if len(done) < self._number:
             todo = sorted(set(range(self._number)) - done)
-            with Meter(self._progress, lambda: self.status) as meter, self._claims as claims:
+            with Meter(self._progress_meter, lambda: self.status) as meter, self._claims as claims:
                 with DeviceQueue(self._devices) as each:
                     work = Work(self._piece, self._lanes, self._block, self._folder, claims, each, order=self._order)
                     yield from work.completed(todo, meter, wait)
@@ -232,6 +236,11 @@ class Sweep:
         at = np.concatenate([np.zeros(0, int), *rows])
         return eqx.combine(jax.tree.map(lambda x: x[at], self._lanes.mapped), self._lanes.rest)
 
+    def to_dataframe(self) -> Any:
+        """`result` as a `pandas.DataFrame` with a row for each lane: the arguments, and what was returned, `RESULTS` by
+        their names. It is in memory as a whole. It needs the package pandas: `pip install nsjax[data]`."""
+        return dataframe(self._fn, self._lanes, self.result())
+
     def to_xarray(self) -> Any:
         """`result` as an `xarray.Dataset` over the dimension `lane`, with the arguments as coordinates. It needs the
         package xarray: `pip install nsjax[data]`."""
@@ -244,11 +253,13 @@ def sweep_in(
     *args: Any,
     chunk: int | None = None,
     devices: Devices | None = None,
+    progress_meter: ProgressMeter = QUIET,
 ) -> Any:
     """`sweep`; with a `path` by a `Sweep` in that folder, a chunk at a time, as each lane is much work."""
     if path is None:
-        return sweep(fn, *args, chunk=chunk, devices=devices)
-    runs = Sweep(fn, *args, path=path, block=chunk or CHUNK, chunk=chunk, devices=devices).run()
+        return sweep(fn, *args, chunk=chunk, devices=devices, progress_meter=progress_meter)
+    how: dict[str, Any] = dict(path=path, block=chunk or CHUNK, chunk=chunk, devices=devices)
+    runs = Sweep(fn, *args, **how, progress_meter=progress_meter).run()
     return jax.tree.map(jnp.asarray, runs.result())
 
 
@@ -258,15 +269,20 @@ def sweep_again(
     *args: Any,
     chunk: int,
     devices: Devices | None = None,
+    tell: Callable[[int], Any],
 ) -> Any:
     """`sweep_in` for a function that is applied again and again, to fewer and fewer lanes: always in chunks of one
-    length, so that all of it is one program. Returns NumPy's arrays."""
+    length, so that all of it is one program. `tell` is called with the number of lanes that are done. Returns NumPy's
+    arrays."""
     lanes = lanes_of(args)
+    number = lanes.number
     if path is None:
-        return on_host(in_pieces(fn, lanes, chunk, 1, devices_of(devices)))
+        return on_host(in_pieces(fn, lanes, chunk, 1, devices_of(devices), tell))
     short = chunk - lanes.number
     if short > 0:
         lanes = jax.tree.map(lambda x: np.concatenate([x, *[x[-1:]] * short]), lanes.mapped), lanes.rest
         args = eqx.combine(*lanes)
-    runs = Sweep(fn, *args, path=path, block=chunk, chunk=chunk, devices=devices).run()
+    runs = Sweep(fn, *args, path=path, block=chunk, chunk=chunk, devices=devices)
+    for block in runs:
+        tell(min(block.stop, number))
     return jax.tree.map(lambda x: x[: min(len(x), len(x) - short)], runs.result())

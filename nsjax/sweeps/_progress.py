@@ -1,11 +1,10 @@
 """How far a long sweep is."""
 
-import contextlib
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
-from .._numerics._progress import ProgressLine
+from .._numerics._progress import a_second, in_words, pace, ProgressMeter, Told
 from .._numerics._text import shown
 
 
@@ -37,21 +36,8 @@ class Status(NamedTuple):
             f"{self.running} running"
         )
         if self.rate > 0 and self.lanes_done < self.lanes:
-            text += f", {self.rate:,.0f} lanes/s, {in_words(self.remaining)} left"
+            text += f", {a_second(self.rate)} lanes/s, {in_words(self.remaining)} left"
         return text
-
-
-def in_words(seconds: float) -> str:
-    """`2 d 3 h`, `4 min 38 s`."""
-    if seconds < 1:
-        return "less than 1 s"
-    left = round(seconds)
-    units = [(left // 86400, "d"), (left // 3600 % 24, "h"), (left // 60 % 60, "min"), (left % 60, "s")]
-    first = next((i for i, (n, _) in enumerate(units) if n), 3)
-    return " ".join(f"{n} {unit}" for n, unit in units[first : first + 2] if n)
-
-
-Progress = bool | Callable[[Status], Any]
 
 
 class Meter:
@@ -62,41 +48,41 @@ class Meter:
     - `status`: of the blocks on the disk.
     """
 
-    def __init__(self, progress: Progress, status: Callable[[], Status]):
-        self._progress, self._status = progress, status
-        self._line = ProgressLine() if progress is True else None
+    def __init__(self, progress_meter: ProgressMeter, status: Callable[[], Status]):
+        self._told, self._status = Told(progress_meter), status
         self._last, self._began, self._before, self._own = status(), time.monotonic(), 0, 0
 
     def __enter__(self) -> Self:
         self._began, self._before, self._own = time.monotonic(), self._last.lanes_done, 0
-        if self._line is not None:
-            self._line.show(self.now())
+        self._show()
         return self
 
     def __exit__(self, *failure: Any) -> None:
-        with contextlib.nullcontext() if self._line is None else self._line:
-            if self._line is not None:
-                self._line.show(self.now())
+        self._show()
+        self._told.__exit__(*failure)
+
+    def _show(self) -> None:
+        if self._told.line is not None:
+            now = self.now()
+            self._told.line.show(now, now.lanes_done / now.lanes if now.lanes else 1.0)
 
     def now(self) -> Status:
         """With the pieces of blocks that are not yet on the disk."""
         done = min(self._last.lanes, self._last.lanes_done + self._own)
         passed = time.monotonic() - self._began
-        rate = (done - self._before) / passed if passed > 0 and done > self._before else float("nan")
-        return self._last._replace(lanes_done=done, rate=rate, remaining=(self._last.lanes - done) / rate)
+        rate, remaining = pace(done - self._before, self._last.lanes - done, passed)
+        return self._last._replace(lanes_done=done, rate=rate, remaining=remaining)
 
     def piece(self, lanes: int) -> None:
         """That many were computed."""
         self._own += lanes
-        if self._line is not None:
-            self._line.show(self.now())
+        self._show()
 
     def block(self, lanes: int) -> None:
         """A block of that many lanes, whose pieces were counted, is on the disk."""
         self._own -= lanes
-        if self._progress:
+        if self._told:
             self._last = self._status()
-            if self._line is not None:
-                self._line.show(self.now())
-            elif callable(self._progress):
-                self._progress(self.now())
+            self._show()
+            if self._told.function is not None:
+                self._told.function(self.now())

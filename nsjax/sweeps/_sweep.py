@@ -10,6 +10,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from .._numerics._compile import eager
+from .._numerics._progress import Counting, ProgressMeter, QUIET, Told
 from .._numerics._text import known, positive
 from ._chunks import in_chunks
 from ._devices import Device, DeviceQueue, Devices, devices_of
@@ -20,10 +21,18 @@ from ._sharded import sharded, spread_over
 
 PIECES = 64  # of a sweep, from which on a piece is of several chunks: each costs a tenth of a millisecond of Python
 
+Tell = Callable[[int], Any]
+
 _run = eqx.filter_jit(in_chunks)
 
 
-def sweep(fn: Callable[..., Any], *args: Any, chunk: int | None = None, devices: Devices | None = None) -> Any:
+def sweep(
+    fn: Callable[..., Any],
+    *args: Any,
+    chunk: int | None = None,
+    devices: Devices | None = None,
+    progress_meter: ProgressMeter = QUIET,
+) -> Any:
     """Applies `fn` to every lane: `jax.vmap(fn)(*args)`, but compiled, and in chunks, which on a CPU is faster for
     thousands of lanes, and works in the memory of one chunk; and on several devices, if there are.
 
@@ -51,6 +60,9 @@ def sweep(fn: Callable[..., Any], *args: Any, chunk: int | None = None, devices:
         after `jax.config.update("jax_num_cpu_devices", n)`.) Derivatives are then to be taken within `fn`.
         A `jax.sharding.Mesh`: the lanes are spread along all its axes, and so is the result if their number can be
         divided evenly; within `jax.jit` and derivatives too, and over the processes of `jax.distributed`.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how many lanes are done, how
+        many in a second, and how long the others will take; `diffrax.TqdmProgressMeter()` draws a bar; a function is
+        called with that after each piece. Pieces are then handed out as with `devices`, to one if none are given.
 
     **Returns:** what `fn` returned, with a first axis of length `lanes`.
 
@@ -60,6 +72,8 @@ def sweep(fn: Callable[..., Any], *args: Any, chunk: int | None = None, devices:
     if chunk is not None:
         positive("chunk", chunk)
     lanes = lanes_of(args)
+    if Told(progress_meter):
+        return _counted(fn, lanes, chunk, devices, progress_meter)
     if isinstance(devices, Mesh):
         return sharded(fn, lanes, chunk, devices, devices.axis_names)
     if devices is not None:
@@ -72,7 +86,18 @@ def sweep(fn: Callable[..., Any], *args: Any, chunk: int | None = None, devices:
     return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, chunk)
 
 
-def _handed_out(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices: Any) -> Any:
+def _counted(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices: Any, meter: ProgressMeter) -> Any:
+    if isinstance(devices, Mesh) or not (eager() and known((fn, lanes))):
+        raise ValueError(
+            "Argument `progress_meter` of `nsjax.sweep` is for sweeps in pieces: not within `jax.jit`, `jax.vmap` and "
+            "derivatives, and not over a `jax.sharding.Mesh`. Leave it out there."
+        )
+    with Counting(meter, lanes.number, "lanes") as counting:
+        own = devices_of(None) if devices is None else devices
+        return _handed_out(fn, lanes, chunk, own, counting.at)
+
+
+def _handed_out(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices: Any, tell: Tell | None = None) -> Any:
     if not (eager() and known((fn, lanes))):
         raise ValueError(
             "Argument `devices` of `nsjax.sweep` must be a `jax.sharding.Mesh` within `jax.jit`, `jax.vmap` and "
@@ -85,11 +110,14 @@ def _handed_out(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices
     chunks, chunk = even_chunks(lanes.number, chunk)
     if not lanes.number:
         return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, 1)
-    return in_pieces(fn, lanes, chunk, min(MOST, -(-chunks // PIECES)), found)
+    return in_pieces(fn, lanes, chunk, min(MOST, -(-chunks // PIECES)), found, tell)
 
 
-def in_pieces(fn: Callable[..., Any], lanes: Lanes, chunk: int, together: int, found: list[Device]) -> Any:
-    """Pieces of so many chunks `together`, each on the device that is free first."""
+def in_pieces(
+    fn: Callable[..., Any], lanes: Lanes, chunk: int, together: int, found: list[Device], tell: Tell | None = None
+) -> Any:
+    """Pieces of so many chunks `together`, each on the device that is free first. `tell` is called with the number of
+    lanes that are done."""
     found = found[: -(-lanes.number // (chunk * together))]  # a device without a piece needs no program
     piece, lanes = Piece(fn, lanes, chunk, together, found), lanes.on_host()
     out = [np.empty((lanes.number, *form.shape), form.dtype) for form in piece.program.forms]
@@ -101,4 +129,6 @@ def in_pieces(fn: Callable[..., Any], lanes: Lanes, chunk: int, together: int, f
         for start, future in zip(starts, futures):
             for whole, part in zip(out, future.result()):
                 whole[start : start + len(part)] = part
+            if tell is not None:
+                tell(min(start + piece.size, lanes.number))
     return jax.tree.unflatten(piece.program.tree, [jnp.asarray(x) for x in out])

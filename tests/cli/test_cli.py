@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import nsjax
 from nsjax import __main__ as command, gallery
-from nsjax._cli import _follow, _search
+from nsjax._cli import _follow, _scorecard, _search
 from nsjax._cli._mistakes import advice
 from nsjax._cli._units import notes, ratio
 
@@ -439,6 +439,19 @@ def test_a_list_that_nobody_reads_to_its_end(monkeypatch):
 
     monkeypatch.setattr(command, "_list", closed)
     assert run("list") == (2, "", "nsjax: error: [Errno 32] Broken pipe\n")
+
+
+def test_scorecard(monkeypatch):
+    """A section of it; and a value that is off ends with status 1."""
+    status, out, err = run("scorecard", "(5.8)")
+    assert (status, err) == (0, "")
+    words = r"\(5\.8\): bifurcation\n  thesis +disc\w+ saddle-node\n  nsjax +disc\w+ saddle-node, 0\n  indep\w+ +0, diff.*\n  agrees\n"
+    assert re.fullmatch(words, out), out
+    rows = tuple(row._replace(known=0.1) for row in _scorecard.POINTS if row.key == "(5.8)")
+    monkeypatch.setattr(_scorecard, "POINTS", rows)
+    assert run("scorecard", "(5.8)")[0] == 1
+    status, out, err = run("scorecard", "(5.88)")
+    assert (status, out) == (2, "") and "'(5.88)'. Did you mean '(5.8)'" in err
 
 
 def test_units_are_read_from_comments():

@@ -1,5 +1,6 @@
 """Continuations of equilibria while they grow: interrupted, saved, loaded, gone on with, and watched."""
 
+import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -152,7 +153,7 @@ def test_starts_that_wait(tmp_path):
 
 def test_progress(grown, capsys):
     whole, points = grown
-    same(continue_equilibrium(*WHAT, **OPTIONS, progress=True), whole.branch)
+    same(continue_equilibrium(*WHAT, **OPTIONS, progress_meter=dfx.TextProgressMeter()), whole.branch)
     written = capsys.readouterr().err
     assert written.endswith("\n") and written.count("\n") == 1
     lines = written.strip("\n").split("\r")

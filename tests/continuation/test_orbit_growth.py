@@ -279,7 +279,7 @@ def test_records_of_changing_shape(duffing):
 
 def test_progress(duffing, capsys):
     what, options, whole, count = duffing
-    branch = nsjax.continue_orbit(*what, **options, progress=True)
+    branch = nsjax.continue_orbit(*what, **options, progress_meter=dfx.TextProgressMeter())
     same(branch, whole.branch)
     written = capsys.readouterr().err
     assert written.endswith("\n") and written.count("\n") == 1

@@ -585,3 +585,22 @@ def test_an_equilibrium_that_slides_is_no_continuum():
 
     orbit = find_orbit(Sliding(), Motion(1.0, 0.2), throw=False, **METHOD)
     assert orbit.result == RESULTS.orbit_is_equilibrium
+
+
+def test_an_orbit_comes_back_from_a_file(tmp_path):
+    """With all that can be done with it; by another solver it would be another orbit, which is refused."""
+    system, path = gallery.StickSlip(), tmp_path / "orbit.npz"
+    orbit = nsjax.find_orbit(system, gallery.Motion(2.0, 0.0), period=13.5)
+    orbit.save(path)
+    again = nsjax.Orbit.load(path, gallery.StickSlip(v_dr=7.0))
+    assert jax.tree.structure(again) == jax.tree.structure(orbit)
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(orbit), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert str(again) == str(orbit) and again.integrator == orbit.integrator
+    np.testing.assert_array_equal(again.path().y.x, orbit.path().y.x)
+    with pytest.raises(ValueError, match="`rtol`, `atol`.* must be those with which the orbit was found.*rtol=1e-12"):
+        nsjax.Orbit.load(path, system, rtol=1e-9)
+    with pytest.raises(
+        ValueError, match="holds an `Orbit`, but an `Solution` was to be loaded. Use `nsjax.Orbit.load`"
+    ):
+        nsjax.Solution.load(path, system)

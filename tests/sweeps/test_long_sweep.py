@@ -6,6 +6,7 @@ import pathlib
 import shutil
 import threading
 
+import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,9 +16,9 @@ from sweep_process import iterated, values
 
 import nsjax
 from nsjax import gallery, RESULTS, Sweep, sweep
+from nsjax._numerics._progress import in_words
 from nsjax.sweeps import _folder, Status
 from nsjax.sweeps._claim import Claims, myself
-from nsjax.sweeps._progress import in_words
 
 
 X = values(1300)
@@ -257,12 +258,12 @@ def test_without_waiting_for_others(finished, tmp_path):
 
 def test_progress(finished, tmp_path, capsys):
     told = []
-    again(finished, tmp_path / "a", progress=told.append).run()
+    again(finished, tmp_path / "a", progress_meter=told.append).run()
     assert [status.blocks_done for status in told] == [1, 2, 3, 4, 5, 6]
     assert all(isinstance(status, Status) and status.rate > 0 for status in told)
     assert told[-1].remaining == 0 and told[0].remaining > 0 and "lanes/s" in str(told[0])
     assert all(a.lanes_done <= b.lanes_done for a, b in zip(told, told[1:]))
-    again(finished, tmp_path / "b", progress=True).run()
+    again(finished, tmp_path / "b", progress_meter=dfx.TextProgressMeter()).run()
     lines = capsys.readouterr().err
     assert lines.count("\n") == 1 and "\r0 of 1,300 lanes (0.0 %), 0 of 6 blocks" in lines
     assert lines.rstrip().endswith("1,300 of 1,300 lanes (100.0 %), 6 of 6 blocks, 0 running")
@@ -329,6 +330,16 @@ def test_xarray(finished):
     assert np.array_equal(data["turns"], found.turns) and np.array_equal(data.x, X)
     meanings = dict(zip(data.result.attrs["flag_meanings"].split(), data.result.attrs["flag_values"]))
     assert int(np.sum(data.result == meanings["max_steps_reached"])) == finished.counts()["max_steps_reached"]
+
+
+def test_dataframe(finished):
+    pytest.importorskip("pandas")
+    rows, found = finished.to_dataframe(), finished.result()
+    assert len(rows) == 1300
+    np.testing.assert_array_equal(rows["x"], X)
+    np.testing.assert_array_equal(rows["turns"], found.turns)
+    np.testing.assert_array_equal(rows["values[0]"], found.values[:, 0])
+    assert rows["result"].value_counts().to_dict() == finished.counts()
 
 
 def test_without_xarray(finished, monkeypatch):

@@ -178,8 +178,6 @@ ARGUMENTS = {
     ),
     "no system": (dict(system=lambda t, y: y), TypeError, "must be an instance of `nsjax.System`"),
     "empty": (dict(y0=()), ValueError, "`y0` must hold at least one number, but it is empty"),
-    "integer": (dict(y0=Motion(1, 0.5)), TypeError, "has the integer 1; write 1.0"),
-    "integers": (dict(y0=Motion(jnp.asarray(1), 0.5)), TypeError, "must be of floating point dtype.*int64"),
     "boolean": (dict(y0=Motion(True, 0.5)), TypeError, "`y0` must hold floating point numbers"),
     "complex": (dict(y0=Motion(1j, 0.5)), TypeError, "must be real.*real and imaginary part"),
     "times": (

@@ -4,12 +4,12 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ..._numerics._text import shown
+from ..._numerics._text import components, shown
 from ..._types import Y
+from ...flow._archive import table
 from ...setvalued._crossing import EigenvalueCrossing
 from ...system._system import System
-from .._archive import table
-from .._branch import AbstractBranch, BranchSegment, descends
+from .._branch import AbstractBranch, BranchSegment, descends, named_apart
 from ._bifurcation import Bifurcation, HalfBranch, unstable_number
 from ._equations import EquilibriumCurve
 
@@ -46,6 +46,13 @@ class Branch(AbstractBranch[Bifurcation]):
     indices: tuple[int, ...]
     ends: tuple[str, str]
     others: "tuple[Branch, ...]" = ()
+
+    def _further(self) -> dict[str, np.ndarray]:
+        names = [switch.name for switch in self.system.switches]
+        columns = named_apart(components(self.ys, 1), self.parameter)
+        columns |= {f"mode.{name}": self.modes[:, k] for k, name in enumerate(names)}
+        columns |= {f"multiplier.{name}": self.multipliers[:, k] for k, name in enumerate(names)}
+        return columns | dict(eigenvalue=self.eigenvalues, unstable=self.unstable)
 
     def _headline(self) -> str:
         return f"{len(self.branches)} {'branches' if self.others else 'branch'} of {type(self.system).__name__}"

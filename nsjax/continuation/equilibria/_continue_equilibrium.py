@@ -10,14 +10,15 @@ import jax
 import numpy as np
 
 from ..._numerics._compile import interactive
+from ..._numerics._progress import ProgressMeter, QUIET, Told
 from ..._numerics._text import shown
 from ..._types import Y
 from ...equilibria._equilibrium import Equilibrium
 from ...equilibria._find_equilibrium import checked_equilibrium, find_equilibrium
+from ...flow._archive import Archive
 from ...system._model import SwitchedSystem
 from ...system._parameter import get_parameter, parameter_path
 from ...system._system import System
-from .._archive import Archive
 from .._checks import check_interval, check_precision, checked_scale
 from .._continuation import AbstractContinuation, growth_types, with_arguments_of
 from .._explorer import Tree
@@ -66,17 +67,18 @@ class EquilibriumContinuation(AbstractContinuation[EquilibriumPoint, Branch]):
         max_step: float = 0.02,
         max_points: int = 2000,
         max_branches: int = 50,
-        progress: bool = False,
+        progress_meter: ProgressMeter = QUIET,
         t: Any = 0.0,
     ):
+        told = Told(progress_meter, ends=False)
         curve, starts = _curve_and_starts(system, start, parameter, interval, scale, t)
         tracer = EquilibriumTracer(curve, max_step, max_points, parameter)
         explorer = EquilibriumExplorer(tracer, parameter, max_branches)
-        self._begin(explorer, explorer.rest(Tree(waiting=tuple(starts))), progress)
+        self._begin(explorer, explorer.rest(Tree(waiting=tuple(starts))), told)
 
     @classmethod
     def load(
-        cls, path: str | os.PathLike, system: System, y: Y | None = None, *, progress: bool = False
+        cls, path: str | os.PathLike, system: System, y: Y | None = None, *, progress_meter: ProgressMeter = QUIET
     ) -> "EquilibriumContinuation":
         """Reads what `save` wrote, to go on with it as if nothing had happened. Nothing in the file is executed.
 
@@ -86,14 +88,14 @@ class EquilibriumContinuation(AbstractContinuation[EquilibriumPoint, Branch]):
         - `system`: a model of the same class and shapes; the values of its parameters are taken from the file.
         - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
             NamedTuples.
-        - `progress`: as for `continue_equilibrium`.
+        - `progress_meter`: as for `continue_equilibrium`.
 
         **Returns:** the `EquilibriumContinuation`.
 
         **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model.
         """
         archive = Archive(path, "EquilibriumContinuation", cls._types, system, y)
-        return cls._loaded(archive, progress, lambda path: dict(path=path), {})
+        return cls._loaded(archive, Told(progress_meter, ends=False), lambda path: dict(path=path), {})
 
 
 @lambda fn: with_arguments_of(EquilibriumContinuation, fn, Branch)
@@ -125,7 +127,9 @@ def continue_equilibrium(*args: Any, **kwargs: Any) -> Branch:
     - `max_step`: the longest step.
     - `max_points`: of one branch; a branch that has more ends there, and says so in `Branch.ends`.
     - `max_branches`: the largest number of branches; a warning says if there are more.
-    - `progress`: whether to write to the standard error stream how far it is.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how far it is: how many
+        branches and points there are, and where on the last one it is; how many are to come is not known. A function is
+        called with the continuation at each point.
     - `t`: the time at which forces are taken.
 
     **Returns:** the `Branch` through the (first) start, with the others in `Branch.others`.

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ..._numerics._text import shown
+from ..._numerics._text import components, shown
 from ..._types import StateT, Y
+from ...flow._archive import table
 from ...orbits._find_orbit import find_orbit
 from ...orbits._orbit import Orbit
 from ...orbits.segments._equations import OrbitCurve
@@ -19,8 +20,7 @@ from ...orbits.segments._itinerary import GRAZING, REPELLING_EXIT, TIME
 from ...setvalued._crossing import EigenvalueCrossing
 from ...system._parameter import parameter_path, put_parameter
 from ...system._system import System
-from .._archive import table
-from .._branch import AbstractBranch, BranchSegment, descends
+from .._branch import AbstractBranch, BranchSegment, descends, named_apart
 from ._bifurcation import OrbitBifurcation, OrbitHalfBranch, Origin
 from ._branch_switching import itinerary_text
 from ._record import states_of
@@ -104,6 +104,15 @@ class OrbitBranch(AbstractBranch[OrbitBifurcation], Generic[StateT]):
             guess = dict(period=self.periods[index]) if system.period is None else {}
         y0 = jax.tree.map(lambda x: jnp.asarray(x[index]), self.ys)
         return find_orbit(system, y0, t0=t0, order=int(self.orders[index]), **guess, **options)
+
+    def _further(self) -> dict[str, np.ndarray]:
+        columns = dict(period=self.periods, order=self.orders, t=self.ts)
+        columns |= named_apart(components(self.ys, 1), self.parameter)
+        for name in ("low", "high", "mean"):
+            columns |= {f"{name}.{part}": x for part, x in components(getattr(self, name), 1).items()}
+        columns |= dict(multiplier=self.multipliers, admissible=self.admissible)
+        columns |= dict(itinerary=np.array(self.itineraries, dtype=object))
+        return columns | {f"record.{name}": values for name, values in self.records.items()}
 
     def _headline(self) -> str:
         count = sum(bool(branch.admissible.any()) for branch in self.branches)

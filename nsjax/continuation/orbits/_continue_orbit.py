@@ -6,8 +6,10 @@ from typing import Any, Generic
 import diffrax as dfx
 import jax.numpy as jnp
 
+from ..._numerics._progress import ProgressMeter, QUIET, Told
 from ..._numerics._text import shown
 from ..._types import StateT, Y
+from ...flow._archive import Archive, plain
 from ...flow._integrator import Integrator
 from ...maps._corner_normal_form import Cycle
 from ...orbits._orbit import Orbit
@@ -16,7 +18,6 @@ from ...orbits.segments._itinerary import OrbitItinerary
 from ...orbits.segments._point import PointData
 from ...system._parameter import FreeParameters, Path
 from ...system._system import System
-from .._archive import Archive, plain
 from .._continuation import AbstractContinuation, growth_types, with_arguments_of
 from .._explorer import Tree
 from ._bifurcation import Origin
@@ -81,12 +82,17 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         max_laps: int = 4,
         virtual: bool = False,
         record: Measures | None = None,
-        progress: bool = False,
+        progress_meter: ProgressMeter = QUIET,
         solver: dfx.AbstractSolver = dfx.Dopri8(),
         stepsize_controller: dfx.AbstractStepSizeController | None = None,
+        rtol: float | None = None,
+        atol: float | None = None,
         max_steps: int = 4096,
     ):
-        integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
+        told = Told(progress_meter, ends=False)
+        integrator = Integrator(solver, stepsize_controller, max_steps).checked(
+            jnp.float64, (1e-12, 1e-6), rtol=rtol, atol=atol
+        )
         curve, start = curve_and_start(system, orbit, parameter, interval, scale, integrator)
         start, value = start.filled(), curve.value
         tracer = OrbitTracer(curve, max_step, max_points)
@@ -96,7 +102,7 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         max_order = max_laps * int(curve.order)
         explorer = OrbitExplorer(tracer, parameter, max_branches, max_order, Recorder(record or {}), virtual)
         upwards = spot if spot.look.tangent[-1] >= 0 else spot.turned
-        self._begin(explorer, explorer.begin(Tree(), upwards), progress)
+        self._begin(explorer, explorer.begin(Tree(), upwards), told)
 
     def _more(self) -> dict[str, Any]:
         integrator = plain(repr(self._explorer.tracer.curve.integrator))
@@ -110,9 +116,11 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         y: Y | None = None,
         *,
         record: Measures | None = None,
-        progress: bool = False,
+        progress_meter: ProgressMeter = QUIET,
         solver: dfx.AbstractSolver = dfx.Dopri8(),
         stepsize_controller: dfx.AbstractStepSizeController | None = None,
+        rtol: float | None = None,
+        atol: float | None = None,
         max_steps: int = 4096,
     ) -> "OrbitContinuation":
         """Reads what `save` wrote, to go on with it as if nothing had happened. Nothing in the file is executed.
@@ -123,18 +131,20 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         - `system`: a model of the same class and shapes; the values of its parameters are taken from the file.
         - `y`: a state, to tell what states look like; needed where they are neither arrays, dictionaries, tuples nor
             NamedTuples.
-        - `record`, `solver`, `stepsize_controller`, `max_steps`: those with which it was begun.
-        - `progress`: as for `continue_orbit`.
+        - `record`, `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`: those with which it was begun.
+        - `progress_meter`: as for `continue_orbit`.
 
         **Raises:** `ValueError` for a file that is damaged, was not written by `save`, or is of another model or solver
         or with other records.
         """
         archive = Archive(path, "OrbitContinuation", cls._types, system, y)
-        integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
+        integrator = Integrator(solver, stepsize_controller, max_steps).checked(
+            jnp.float64, (1e-12, 1e-6), rtol=rtol, atol=atol
+        )
         if plain(repr(integrator)) != archive.part("integrator"):
             raise ValueError(
-                "Arguments `solver`, `stepsize_controller` and `max_steps` must be those with which the branch was "
-                f"begun, {archive.part('integrator')}, but are {plain(repr(integrator))}."
+                "Arguments `solver`, `stepsize_controller`, `rtol`, `atol` and `max_steps` must be those with which "
+                f"the branch was begun, {archive.part('integrator')}, but are {plain(repr(integrator))}."
             )
         recorder = Recorder(record or {})
         if sorted(recorder.measures) != archive.part("record"):
@@ -146,7 +156,7 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         def for_curve(path: Path) -> dict[str, Any]:
             return dict(free=FreeParameters.of(archive.system, path), integrator=integrator)
 
-        growth = cls._loaded(archive, progress, for_curve, dict(recorder=recorder))
+        growth = cls._loaded(archive, Told(progress_meter, ends=False), for_curve, dict(recorder=recorder))
         for name, value in growth._tree.branches[0][1].points[0].record.items():
             recorder.shapes[name] = value.shape
         return growth
@@ -201,9 +211,12 @@ def continue_orbit(*args: Any, **kwargs: Any) -> OrbitBranch:
         branch = nsjax.continue_orbit(system, orbit, "omega", (0.5, 2.0), record={"P": power, "stick": sticking})
         nsjax.plot.orbit_diagram(branch, "P")
         ```
-    - `progress`: whether to write to the standard error stream how far it is.
-    - `solver`, `stepsize_controller`, `max_steps`: as for `solve`, of each segment; by default Dopri8 with tolerances
-        of 1e-12. (Where the field is affine in the state between events, segments are matrix exponentials anyway.)
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how far it is: how many
+        branches and points there are, and where on the last one it is; how many are to come is not known. A function is
+        called with the continuation at each point.
+    - `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`: as for `solve`, of each segment; by default Dopri8
+        with tolerances of 1e-12. (Where the field is affine in the state between events, segments are matrix
+        exponentials anyway.)
 
     **Returns:** the `OrbitBranch` through `orbit`, with the others in `OrbitBranch.others`.
 

@@ -80,7 +80,7 @@ def newton_turns(
     blank = Linear(*(jnp.zeros(shape, guess.dtype) for shape in ((size - m,), (rows, n), (size - m, size), (size,))))
     ended, no, none = ~jnp.asarray(newton), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
     first = Turn(guess, guess, blank, ended, good=no, over=no, spoilt=no, count=none)
-    return lax.while_loop(lambda c: ~c.over & (c.count <= method.max_iterations), turn, first)
+    return lax.while_loop(lambda c: ~c.over & (c.count <= method.max_steps), turn, first)
 
 
 def linear_at(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, origin: Array) -> Linear:

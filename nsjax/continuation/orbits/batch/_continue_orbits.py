@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ...._numerics._compile import on_host
+from ...._numerics._progress import ProgressMeter, QUIET
 from ...._numerics._text import shown
 from ...._types import Y
 from ....flow._integrator import Integrator
@@ -108,10 +109,13 @@ def continue_orbits(
     max_step: float = 0.02,
     solver: dfx.AbstractSolver = dfx.Dopri8(),
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
     max_steps: int = 4096,
     chunk: int | None = None,
     devices: Devices | None = None,
     path: str | os.PathLike | None = None,
+    progress_meter: ProgressMeter = QUIET,
 ) -> OrbitBranches:
     """Follows many periodic orbits at once while a parameter varies, each both ways to its first corner.
 
@@ -137,16 +141,20 @@ def continue_orbits(
     - `parameter`, `interval`: the name of the parameter that varies, and its interval.
     - `points`: the largest number of points each way.
     - `scale`: the typical size of each component of the state; by default what it has along the first orbit.
-    - `max_step`, `solver`, `stepsize_controller`, `max_steps`: as for `continue_orbit`.
+    - `max_step`, `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`: as for `continue_orbit`.
     - `chunk`, `devices`: how many lanes go together, and on which devices, see `sweep`.
     - `path`: a folder that keeps the branches, a chunk of lanes at a time, and from which a call that was interrupted
         goes on; see `Sweep`.
+    - `progress_meter`: `diffrax.TextProgressMeter()` writes to the standard error stream how many lanes are done, how
+        many in a second, and how long the others will take; see `sweep`.
 
     **Returns:** `OrbitBranches`. Lanes without an orbit to start from, or outside the interval, have no points.
 
     **Raises:** `ValueError` for an unknown parameter, in single precision, or if no lane has an orbit to start from.
     """
-    integrator = Integrator(solver, stepsize_controller, max_steps).checked(jnp.float64, (1e-12, 1e-6))
+    integrator = Integrator(solver, stepsize_controller, max_steps).checked(
+        jnp.float64, (1e-12, 1e-6), rtol=rtol, atol=atol
+    )
     each = list(orbits) if isinstance(orbits, Sequence) else _unstacked(orbits)
     for one in each:
         check_precision(jnp.result_type(one.t0), "find `orbit`")
@@ -167,7 +175,9 @@ def continue_orbits(
     twice = jax.tree.map(lambda x: np.concatenate([x, x]), (lanes, np.array(good)))
     upwards = np.repeat([1.0, -1.0], len(each))
     follow = _Follow(curve, jnp.asarray(max_step), points)
-    found = on_host(sweep_in(path, follow, *twice, upwards, chunk=chunk, devices=devices))
+    found = on_host(
+        sweep_in(path, follow, *twice, upwards, chunk=chunk, devices=devices, progress_meter=progress_meter)
+    )
     return _gathered(curve, parameter, lanes, found)
 
 

@@ -98,14 +98,17 @@ class Archive:
         self._header, self._vectors = self._read()
         header = self._header
         if header["kind"] != kind:
-            raise ValueError(f"The file {self._path} holds an `{header['kind']}`, but an `{kind}` was to be loaded.")
+            raise ValueError(
+                f"The file {self._path} holds an `{header['kind']}`, but an `{kind}` was to be loaded. Use "
+                f"`nsjax.{header['kind']}.load`."
+            )
         if header["types"] != {name: _fields(cls) for name, cls in types.items()}:
             raise ValueError(f"Another version of nsjax wrote the file {self._path}: its types have other fields.")
         system = arrays_of(system, np.float64)
         if header["model"] != signature(system):
             raise ValueError(
                 f"Argument `system` must be a model like that of the file, {header['model']}, but is "
-                f"{signature(system)}."
+                f"{signature(system)}. Make one of that class and those shapes; the numbers are taken from the file."
             )
         self.system = self._decoded(header["system"], dict(system=system))
         self.y = _like(header["state"], [self._decoded(leaf, {}) for leaf in header["leaves"]], self.system, y)
@@ -130,7 +133,7 @@ class Archive:
             age = "A newer" if other > 0 else "An older"
             raise ValueError(
                 f"{age} version of nsjax wrote the file {self._path}, in format {header['format']}; this one reads "
-                f"format {FORMAT}. Make the branch anew, or read it with that version."
+                f"format {FORMAT}. Compute it anew, or read it with that version."
             )
         return header, vectors
 
