@@ -243,6 +243,7 @@ def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar
 
 
 FEW = 8  # polynomials looked at together, of many
+DENSE = 24  # up to so many all are looked at
 
 
 def first_roots(
@@ -251,7 +252,7 @@ def first_roots(
     """`first_root` of each of them. Of many, most are positive all along, and only the others are looked at, as far as
     they are wanted."""
     count = len(a[0])
-    if count <= 4 * FEW:
+    if count <= DENSE:
         return jax.vmap(first_root)(a)
     busy = ~no_root(a) & wanted()
     rank = jnp.cumsum(busy.astype(jnp.int32))
