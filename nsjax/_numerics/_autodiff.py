@@ -57,7 +57,14 @@ def dense_jacobian(fn: Callable[..., Any], *args: Any) -> Any:
     So `jax.linearize`, which optimistix's Newton method uses, and transposition work for a `fn` that contains a
     `while_loop`. Costs one forward derivative for each perturbed number among `args` and what `fn` closes over.
     """
-    return _call((eqx.filter_closure_convert(fn, *args), args))
+    kept: list[Any] = []
+
+    def arrays(*args: Any) -> Any:  # a result may hold functions, as models with neural networks do
+        found, rest = eqx.partition(fn(*args), eqx.is_array)
+        kept.append(rest)
+        return found
+
+    return eqx.combine(_call((eqx.filter_closure_convert(arrays, *args), args)), kept[0])
 
 
 @eqx.filter_custom_jvp
@@ -80,13 +87,9 @@ def _call_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
         for i, value in zip(moved, unravel(x)):
             full[i] = value
         fn, args = jax.tree.unflatten(tree, full)
-        out = fn(*args)
-        smooth, rest = eqx.partition(out, eqx.is_inexact_array)
-        arrays, static = eqx.partition(rest, eqx.is_array)
-        kept.append(static)
-        return smooth, (smooth, arrays)
+        smooth, rest = eqx.partition(fn(*args), eqx.is_inexact_array)
+        return smooth, (smooth, rest)
 
-    kept: list[Any] = []
     # Leaf by leaf: the Jacobian of a result that is not used is never computed.
-    matrices, (smooth, arrays) = jax.jacfwd(flat, has_aux=True)(x)
-    return eqx.combine(smooth, arrays, kept[0]), jax.tree.map(lambda m: jnp.dot(m, dx.astype(m.dtype)), matrices)
+    matrices, (smooth, rest) = jax.jacfwd(flat, has_aux=True)(x)
+    return eqx.combine(smooth, rest), jax.tree.map(lambda m: jnp.dot(m, dx.astype(m.dtype)), matrices)

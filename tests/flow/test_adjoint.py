@@ -141,6 +141,20 @@ class Learned(nsjax.System):
         return y.v - self.v_dr
 
 
+def test_a_model_that_holds_functions():
+    """The activation of a network is a function, and comes back with the solution's system."""
+    law, rest = eqx.partition(eqx.nn.MLP("scalar", "scalar", 2, 1, key=jax.random.key(0)), eqx.is_inexact_array)
+    law = jax.tree.map(lambda x: x.astype(float), law)
+
+    def end(law, adjoint):
+        return solve(Learned(eqx.combine(law, rest)), 0.0, 3.0, Motion(1.0, 0.0), adjoint=adjoint, **CHEAP).y1.x
+
+    backward = jax.jit(jax.grad(lambda law: end(law, dfx.DirectAdjoint())))(law)
+    forward = jax.jit(jax.jacfwd(lambda law: end(law, dfx.ForwardMode())))(law)
+    assert max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(forward)) > 0.01
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12), backward, forward)
+
+
 @pytest.mark.slow
 def test_many_parameters():
     """A network's friction law is fitted to a trajectory with stick phases: the loss falls a hundredfold."""
