@@ -62,9 +62,9 @@ def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> So
     if not isinstance(options.integrator.adjoint, dfx.RecursiveCheckpointAdjoint):
         system, t0, t1, y0 = forward_only(
             (system, t0, t1, y0),
-            "`nsjax.solve` was differentiated in reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`), which needs "
-            "`adjoint=diffrax.DirectAdjoint()` (up to some tens of parameters and states) or "
-            "`adjoint=diffrax.RecursiveCheckpointAdjoint()` (more). Or use `jax.jacfwd`.",
+            "`nsjax.solve` was linearised (as by optimistix's least squares) or differentiated in reverse mode, as by "
+            "`jax.grad`. That works with `adjoint=diffrax.DirectAdjoint()` (up to some tens of parameters and states); "
+            "reverse mode also with `diffrax.RecursiveCheckpointAdjoint()` (more). Or use `jax.jacfwd`.",
         )
         if len(system.switches) > WRITTEN_OUT:
             run = merged(run)
@@ -103,8 +103,7 @@ def _flow(
     def guards(ty: tuple[Scalar, Y]) -> list[Array]:
         return [jnp.stack(row) for row in model.guards(*ty, state)]
 
-    def rates(ty: tuple[Scalar, Y]) -> Any:
-        """What multipliers are made of: where they are solved for, comparisons say nothing of jumps."""
+    def rates(ty: tuple[Scalar, Y]) -> Any:  # multipliers are made of these: that solving compares is no jump
         return model.rates(model.holdable, *ty, state, model.signs(ty[0], state))
 
     bent, leaps = bends_and_jumps(guards, (t, y))
