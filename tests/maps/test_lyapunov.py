@@ -1,7 +1,5 @@
 """Lyapunov exponents against closed forms and independent computations."""
 
-from typing import NamedTuple
-
 import branch_reference
 import diffrax
 import jax
@@ -9,18 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from exponents import ImpactOscillator, largest_exponent, mean_of_finite, StickSlip
-from models import PeriodicHammer, pid
+from models import Beats, PeriodicHammer, pid
 from tent import Corner
 
 import nsjax
 from nsjax import gallery
 from nsjax.gallery import Motion
 from nsjax.maps._lyapunov import standard_errors
-
-
-class Beats(NamedTuple):
-    x: float
-    phase: float
 
 
 class Tent(nsjax.System):
