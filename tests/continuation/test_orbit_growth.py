@@ -206,7 +206,7 @@ def test_mistakes(belt, duffing, tmp_path):
 
     for changes, message in (
         (dict(format=3), "A newer version of nsjax"),
-        (dict(format=1), "An older version of nsjax.*Make the branch anew"),
+        (dict(format=1), "An older version of nsjax.*Compute it anew"),
         (dict(kind="OrbitBranch"), "holds an `OrbitBranch`"),
         (dict(types={}), "Another version of nsjax"),
         (dict(objects=[]), "is damaged"),

@@ -356,7 +356,7 @@ MISTAKES = [
     ),
     (Valve(), Heat(1.0), ValueError, "`Valve.vector_field` has a kink that depends on `s.heater`"),
     (Support, Motion(1.0, 0.0), TypeError, "Argument `system` must be an instance.*Call it"),
-    (Support(), Motion(1, 0), TypeError, "Argument `y0` must hold floating point numbers"),
+    (Support(), Motion(True, 0.5), TypeError, "Argument `y0` must hold floating point numbers"),
 ]
 
 
