@@ -243,7 +243,7 @@ def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar
 
 
 FEW = 8  # polynomials looked at together, of many
-DENSE = 24  # up to so many all are looked at
+DENSE = 24  # up to so many all are looked at: two for each guard, see `locate`
 
 
 def first_roots(
@@ -261,12 +261,12 @@ def first_roots(
     table = jnp.stack(a, axis=-1)
 
     def look(carry: tuple) -> tuple:
-        start, found, root = carry
-        place = jax.lax.dynamic_slice(order, (start,), (FEW,))
+        begin, found, root = carry
+        place = jax.lax.dynamic_slice(order, (begin,), (FEW,))
         some = table.at[place].get(mode="clip")
         new = jax.vmap(first_root)([some[..., j] for j in range(len(a))])
         found, root = (x.at[place].set(y, mode="drop") for x, y in zip((found, root), new))
-        return start + FEW, found, root
+        return begin + FEW, found, root
 
     start = (jnp.zeros((), jnp.int32), jnp.zeros(count, bool), jnp.ones(count, a[0].dtype))
     return jax.lax.while_loop(lambda carry: carry[0] < rank[-1], look, start)[1:]

@@ -15,7 +15,7 @@ PAUSE = 0.1  # [s] between two writings
 
 ProgressMeter: TypeAlias = dfx.AbstractProgressMeter | Callable[[Any], Any]
 QUIET = dfx.NoProgressMeter()
-RENAMED = {"progress": "Write `progress_meter=diffrax.TextProgressMeter()`."}  # of arguments that were called otherwise
+RENAMED = {"progress": "Write `progress_meter=diffrax.TextProgressMeter()`."}  # of what one might call it otherwise
 
 
 class ProgressLine:

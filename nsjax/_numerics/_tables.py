@@ -41,9 +41,10 @@ def frame(asked: str, columns: Iterable[tuple[str, Any]]) -> Any:
 def lanes_of(shape: tuple[int, ...], last: int = 1) -> list[tuple[str, np.ndarray]]:
     """Columns that tell rows of a batch apart: of each of the leading axes its index, for rows that run over the last
     ones too."""
-    batch = shape[: len(shape) - last]
-    if not batch:
-        return []
-    places = np.indices(shape).reshape(len(shape), -1)
-    names = ["lane"] if len(batch) == 1 else [f"lane{i}" for i in range(len(batch))]
-    return list(zip(names, places))
+    names = lane_names(len(shape) - last)
+    return list(zip(names, np.indices(shape).reshape(len(shape), -1))) if names else []
+
+
+def lane_names(axes: int) -> list[str]:
+    """Of the leading axes of a batch: `lane`, or of several `lane0`, `lane1`, ...."""
+    return ["lane"] if axes == 1 else [f"lane{i}" for i in range(axes)]

@@ -117,6 +117,15 @@ class Archive:
         """One of the parts; `forms` as for `save`."""
         return self._decoded(self._header["parts"][name], dict(system=self.system, y=self.y, **forms))
 
+    def check_integrator(self, integrator: Any, names: str, when: str) -> None:
+        """That the part `integrator` tells of the same one as is given: its equations are solved by it.
+
+        **Raises:** `ValueError` that names the arguments; `when` says of what they are to be those.
+        """
+        own, given = self.part("integrator"), plain(repr(integrator))
+        if given != own:
+            raise ValueError(f"Arguments {names} must be those with which the {when}, {own}, but are {given}.")
+
     def _read(self) -> tuple[Any, dict[str, np.ndarray]]:
         try:
             with open(self._path, "rb") as raw, np.load(raw, allow_pickle=False) as file:

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._numerics._tables import package
+from .._numerics._tables import lane_names, package
 from .._numerics._text import components
 from ._results import result_names
 
@@ -14,7 +14,7 @@ def dataset_of(sol: Any) -> Any:
     """Of a `Solution`, or of a batch."""
     xarray = package("xarray", "Solution.to_xarray")
     batch = np.shape(sol.t1)
-    lanes = ["lane"] if len(batch) == 1 else [f"lane{i}" for i in range(len(batch))]
+    lanes = lane_names(len(batch))
     variables: dict[str, Any] = {}
     coordinates: dict[str, Any] = {}
 

@@ -188,11 +188,8 @@ class Orbit(eqx.Module, Generic[StateT]):
         integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(
             orbit.t0.dtype, (1e-12, 1e-6), rtol=rtol, atol=atol
         )
-        if plain(repr(integrator)) != archive.part("integrator"):
-            raise ValueError(
-                "Arguments `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps` and `max_events` must be those "
-                f"with which the orbit was found, {archive.part('integrator')}, but are {plain(repr(integrator))}."
-            )
+        names = "`solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps` and `max_events`"
+        archive.check_integrator(integrator, names, "orbit was found")
         return dataclasses.replace(orbit, integrator=integrator)
 
     def __str__(self) -> str:

@@ -69,7 +69,8 @@ class SwitchedSystem(Clocked):
         reach = self._reach(range(len(order)), lambda s: rates(list(range(len(order))), t, y, s), zeros)
         hard = [k for k, n in enumerate(order) if n == 2 and self.parts[k] == 1 and not reach[k].any()]
         for k, row in zip(hard, self._reach(hard, second, zeros)):
-            reach[k] = row & row[k]
+            if row[k]:  # a force that acts on the gap of its own contact
+                reach[k] = row
         self.holdable = tuple(k for k, n in enumerate(order) if (n == 1 or k in hard) and reach[k, k])
         self.contacts = tuple(k for k in self.holdable if order[k] == 2)
         self.holding = tuple(self.switches[k].holding for k in self.holdable)
@@ -85,10 +86,11 @@ class SwitchedSystem(Clocked):
         def effects(args: tuple[Scalar, Y, tuple]) -> list[Any]:
             t, y, s = args
 
+            at = tuple(s[j] for j in self.holdable)
+
             def of(ds: tuple) -> Any:
                 return jax.jvp(lambda *held: rates(dry, t, y, put(s, self.holdable, held)), at, ds)[1]
 
-            at = tuple(s[j] for j in self.holdable)
             return jax.vmap(of)(tuple(jnp.eye(len(at), dtype=one.dtype)))
 
         self.steady = not dry or is_constant(effects, (t, y, zeros))

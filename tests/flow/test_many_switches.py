@@ -14,7 +14,7 @@ from nsjax import gallery
 from nsjax.gallery import Motion, thesis
 
 
-N = 4
+N = 5  # of four blocks all guards would be searched
 STARTS = np.stack([2 * np.sin(1.0 + np.arange(N)), np.cos(3.0 * np.arange(N))])
 TS = jnp.linspace(0.0, 9.0, 19)
 TIGHT = dict(stepsize_controller=diffrax.PIDController(rtol=1e-11, atol=1e-11))
@@ -75,6 +75,17 @@ def test_as_each_alone(singles):
         return sol.ys.x, (sol.events.t, sol.events.num)
 
     check(singles, of_v, lambda x: x.T)
+
+
+def test_a_belt_that_is_all_but_met():
+    """One block comes as near as 1e-4 to the velocity of the belt; the others, far from it, count for nothing."""
+    near, how = 0.2 - 1e-4, dict(stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8))
+    start = State(jnp.full(N, 1.01).at[3].set(1 + near), jnp.zeros(N))  # x = 1 + near cos t
+    many = nsjax.solve(Blocks(), 0.0, 9.0, start, **how)
+    one = nsjax.solve(thesis("3.4"), 0.0, 9.0, Motion(1 + near, 0.0), **how)
+    for sol in (many, one):
+        assert len(sol.events) == 0
+        assert float(sol.margin) == pytest.approx(1e-4 / (1e-8 * (1 + near)), rel=1e-2)
 
 
 @pytest.mark.slow

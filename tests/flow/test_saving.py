@@ -78,7 +78,9 @@ def test_a_state_that_is_an_array(tmp_path):
 
     found = nsjax.solve(Decay(), 0.0, 1.0, np.array([1, 2]), max_steps=64)
     found.save(tmp_path / "sol.npz")
-    same(Solution.load(tmp_path / "sol.npz", Decay()), found)
+    again = Solution.load(tmp_path / "sol.npz", Decay())
+    np.testing.assert_allclose(again.y1, np.array([1, 2]) * np.exp(-1), rtol=1e-6)
+    same(again, found)
 
 
 def test_events_as_a_table(sol):

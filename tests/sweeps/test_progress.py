@@ -52,7 +52,7 @@ def test_a_line(capsys):
     nsjax.sweep(double, X, chunk=256, progress_meter=dfx.TextProgressMeter())
     written = capsys.readouterr().err
     assert written.count("\n") == 1 and written.startswith("\r0 of 1,000 lanes")
-    assert written.rstrip().endswith("\r1,000 of 1,000 lanes (100.0 %)".ljust(0)) or "1,000 of 1,000" in written
+    assert written.rpartition("\r")[2].rstrip() == "1,000 of 1,000 lanes (100.0 %)"
     nsjax.sweep(double, X, chunk=256)
     assert capsys.readouterr().err == ""
 

@@ -141,11 +141,8 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         integrator = Integrator(solver, stepsize_controller, max_steps).checked(
             jnp.float64, (1e-12, 1e-6), rtol=rtol, atol=atol
         )
-        if plain(repr(integrator)) != archive.part("integrator"):
-            raise ValueError(
-                "Arguments `solver`, `stepsize_controller`, `rtol`, `atol` and `max_steps` must be those with which "
-                f"the branch was begun, {archive.part('integrator')}, but are {plain(repr(integrator))}."
-            )
+        names = "`solver`, `stepsize_controller`, `rtol`, `atol` and `max_steps`"
+        archive.check_integrator(integrator, names, "branch was begun")
         recorder = Recorder(record or {})
         if sorted(recorder.measures) != archive.part("record"):
             raise ValueError(

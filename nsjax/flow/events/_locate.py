@@ -99,7 +99,7 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
     lows = [jnp.where(first, x, -1.0) for x in falls(polynomials)]
     both = [jnp.concatenate(pair) for pair in zip(deflate(polynomials, known), lows)]
 
-    def wanted() -> Bool[Array, " rows"]:  # a guard that stays far from zero is not nearly missed
+    def wanted() -> Bool[Array, " rows"]:  # all roots, and the least values of guards that come near to zero
         near = jnp.any(lowest(polynomials) < NEAR * largest(polynomials), axis=-1)
         return jnp.concatenate([jnp.ones_like(near), near])
 
