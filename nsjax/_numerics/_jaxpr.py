@@ -22,6 +22,17 @@ ELEMENTWISE = frozenset(
 )
 
 
+def _union(m: np.ndarray, axes: Any = None) -> np.ndarray:
+    """What is marked anywhere along these axes."""
+    found = np.bitwise_or.reduce(m, axis=axes, initial=0)
+    return np.asarray(found, m.dtype)  # NumPy hands out integers of Python by themselves
+
+
+def _either(*ms: np.ndarray) -> np.ndarray:
+    """What is marked in any of them, entry by entry."""
+    return _union(np.stack(ms), 0)
+
+
 def _padded(p: dict, m: np.ndarray, filler: np.ndarray) -> np.ndarray:
     """`lax.pad` of marks, or of what else an array may hold."""
     places = [lo + (inner + 1) * np.arange(n) for n, (lo, _, inner) in zip(m.shape, p["padding_config"])]
@@ -42,7 +53,7 @@ MOVING: dict[str, Callable[..., Any]] = {
     ),
     "concatenate": lambda p, *ms: np.concatenate(ms, p["dimension"]),
     "pad": _padded,
-    "reduce_sum": lambda p, m: m.any(p["axes"]),
+    "reduce_sum": lambda p, m: _union(m, p["axes"]),
     "reshape": lambda p, m: m.reshape(p["new_sizes"]),
     "rev": lambda p, m: np.flip(m, p["dimensions"]),
     "slice": lambda p, m: m[tuple(map(slice, p["start_indices"], p["limit_indices"], p["strides"] or [1] * m.ndim))],
@@ -53,7 +64,7 @@ MOVING: dict[str, Callable[..., Any]] = {
 }
 
 
-Mask = np.ndarray  # of booleans, as large as the array of whose entries it tells
+Mask = np.ndarray  # of truth values, or of integers with a bit for each of many; as large as the array of which it tells
 
 
 def _masks(jaxpr: Any, inputs: list[Mask], leapt: list[Mask] | None = None) -> tuple[list[Mask], list[Mask]]:
@@ -88,14 +99,15 @@ def _passed_on(e: Any, have: list[Mask]) -> list[Mask]:
     if not any(m.any() for m in have):
         return [np.zeros(getattr(v.aval, "shape", ()), bool) for v in e.outvars]
     if name in ELEMENTWISE:
-        return [np.any(np.broadcast_arrays(*have), axis=0)]
+        return [_either(*np.broadcast_arrays(*have))]
     if name in MOVING:
         moved = MOVING[name](e.params, *have)
         return moved if isinstance(moved, list) else [moved]
     if name == "dot_general" and not e.params["dimension_numbers"][1][0]:
-        left, right = (m.any(tuple(axes)) for m, axes in zip(have, e.params["dimension_numbers"][0]))
-        return [np.logical_or.outer(left, right)]
-    return [np.ones(getattr(v.aval, "shape", ()), bool) for v in e.outvars]
+        left, right = (_union(m, tuple(axes)) for m, axes in zip(have, e.params["dimension_numbers"][0]))
+        return [np.bitwise_or.outer(left, right)]
+    marks = _either(*map(_union, have))
+    return [np.broadcast_to(marks, getattr(v.aval, "shape", ())) for v in e.outvars]
 
 
 def _of_leaves(fn: Callable[[Any], Any], x: Any) -> tuple[list[bool], list[bool]]:
@@ -136,11 +148,9 @@ def is_affine(fn: Callable[[Any], Any], x: Any) -> bool:
 def dependence(fn: Callable[[Any], Any], x: Any) -> np.ndarray:
     """Which results of `fn`, scalars, may depend on which numbers of `x`: booleans `(results, numbers)`."""
     jaxpr = jax.make_jaxpr(fn)(x).jaxpr
-    none = [np.zeros(v.aval.shape, bool) for v in jaxpr.invars]
-    columns = []
-    for n, mask in enumerate(none):
-        for i in np.ndindex(mask.shape):
-            marked = mask.copy()
-            marked[i] = True
-            columns.append([m.any() for m in _masks(jaxpr, [*none[:n], marked, *none[n + 1 :]])[0]])
-    return np.array(columns, bool).reshape(len(columns), len(jaxpr.outvars)).T
+    shapes = [v.aval.shape for v in jaxpr.invars]
+    ends = np.cumsum([0, *map(np.prod, shapes)], dtype=int)
+    bits = np.array([1 << i for i in range(ends[-1])], object)  # integers of Python: of any number of bits
+    masks = [bits[start:end].reshape(shape) for start, end, shape in zip(ends, ends[1:], shapes)]
+    found = [int(_union(m)) for m in _masks(jaxpr, masks)[0]]
+    return np.array([[bool(marks & bit) for bit in bits] for marks in found], bool).reshape(len(found), len(bits))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nsjax._numerics._jaxpr import is_affine, is_constant
+from nsjax._numerics._jaxpr import dependence, is_affine, is_constant
 
 
 M = jnp.arange(1.0, 10.0).reshape(3, 3)
@@ -55,3 +55,18 @@ def test_affine():
     assert is_affine(lambda x: jnp.sin(x[1]) * 0 + x[0], x) is False
     assert is_affine(lambda x: jnp.concatenate([x, x**2])[:2], x)
     assert not is_affine(lambda x: jnp.concatenate([x, x**2])[1:], x)
+
+
+def test_dependence_on_many_numbers_at_once():
+    """Of each scalar on each of more numbers than a word has bits, in two leaves: where it is zero the Jacobian is."""
+    x = {"a": jnp.linspace(0.1, 1.0, 70), "b": jnp.linspace(1.0, 2.0, 6).reshape(2, 3)}
+
+    def fn(x):
+        bent = jnp.sin(x["a"])
+        moved = [bent[0] * bent[69], jnp.sum(x["b"][:, 1]), jnp.where(x["a"][69] > 0, x["b"][1, 2], 2.0), jnp.asarray(1.0)]
+        return [*moved, jnp.pad(x["a"], (2, 0))[3], (x["b"] @ M)[1, 0], jnp.sum(x["a"][::2]), jnp.linalg.norm(x["a"])]
+
+    wanted = np.zeros((8, 76), bool)
+    wanted[0, [0, 69]] = wanted[1, [71, 74]] = wanted[2, [69, 75]] = wanted[4, 1] = wanted[5, 73:76] = True
+    wanted[6, :70:2] = wanted[7, :70] = True
+    assert (dependence(fn, x) == wanted).all()
