@@ -64,7 +64,7 @@ MOVING: dict[str, Callable[..., Any]] = {
 }
 
 
-Mask = np.ndarray  # of truth values, or of integers with a bit for each of many; as large as the array of which it tells
+Mask = np.ndarray  # of truth values, or of integers with a bit for each of many; as large as what it tells of
 
 
 def _masks(jaxpr: Any, inputs: list[Mask], leapt: list[Mask] | None = None) -> tuple[list[Mask], list[Mask]]:
