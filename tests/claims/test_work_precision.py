@@ -78,6 +78,15 @@ def test_picture(table):
     plt.close("all")
 
 
+def test_table_of_pandas():
+    pytest.importorskip("pandas")
+    rows = (Row("Tsit5", 1e-6, 0.5, 1e-7, 2.0, None, ""), Row("Heun", 1e-6, float("nan"), float("nan"), 1.0, 7, "no"))
+    table = nsjax.WorkPrecision(rows, 0.0).to_dataframe()
+    assert list(table) == list(Row._fields) and list(table["method"]) == ["Tsit5", "Heun"]
+    np.testing.assert_array_equal(table["evaluations"], [np.nan, 7.0])
+    assert list(table["failure"]) == ["", "no"]
+
+
 def test_a_method_has_one_colour():
     """In whatever order and company; variants of one kind differ in their lines."""
 
