@@ -111,7 +111,7 @@ def write_names(ax: "Axes", points: Sequence[tuple[float, float, str]]) -> None:
         name = ax.annotate(text, (x, y), tuple(center - at), textcoords="offset points", arrowprops=line, **style)
         name.set_in_layout(False)  # it was placed for axes of this size
         # Twice, as words on words are worse than words on a line.
-        grid = np.stack(np.meshgrid(*np.linspace(center - half, center + half, 8).T), axis=-1).reshape(-1, 2)
+        grid = _filled(np.stack([center - half, center + half]), 8)
         occupied = np.concatenate([occupied, np.repeat(grid, 2, axis=0), *[_along(at, center)] * (gap > CLOSE)])
 
 
@@ -121,6 +121,11 @@ def _extent(ax: "Axes", text: str) -> np.ndarray:
     box = trial.get_window_extent()
     trial.remove()
     return np.array([box.width, box.height])
+
+
+def _filled(corners: np.ndarray, count: int) -> np.ndarray:
+    """Places all over a box, `count` each way, from its lower and upper corner."""
+    return np.stack(np.meshgrid(*np.linspace(corners[0], corners[1], count).T), axis=-1).reshape(-1, 2)
 
 
 def _along(start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -149,10 +154,8 @@ def _occupied(ax: "Axes", size: float, window: np.ndarray) -> np.ndarray:
             corners = radius * np.array([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
             found.append((xy[:, None] + corners).reshape(-1, 2))
     for text in ax.texts:
-        box = size * text.get_window_extent().get_points()
-        found.append(np.stack(np.meshgrid(*np.linspace(*box, 8).T), axis=-1).reshape(-1, 2))
+        found.append(_filled(size * text.get_window_extent().get_points(), 8))
     legend = ax.get_legend()
     if legend is not None:
-        box = size * legend.get_window_extent().get_points()
-        found.append(np.stack(np.meshgrid(*np.linspace(*box, 20).T), axis=-1).reshape(-1, 2))
+        found.append(_filled(size * legend.get_window_extent().get_points(), 20))
     return np.concatenate(found)
