@@ -2,7 +2,8 @@
 
     python benchmarks/work_precision.py --out benchmarks/work_precision
 
-Prints a table in Markdown for each, writes all rows to `<out>.json` and the pictures to `<out>_<system>.png`.
+Prints a table in Markdown for each, writes all rows to `<out>.json` and the pictures to `<out>_<system>.png`. With
+`--draw` nothing is measured: the pictures are drawn from the rows that are there.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from sweep import Hammer, machine
 
 import nsjax
 from nsjax import Exponential, gallery, Method, Taylor
+from nsjax._work_precision import Row
 from nsjax.gallery import Motion
 
 
@@ -98,6 +100,26 @@ def compare(system: Any, quantity: Any, chosen: dict[str, Method], args: Any) ->
     return nsjax.WorkPrecision(table.rows + more.rows, table.doubt)
 
 
+def draw(out: str, key: str, tables: dict[str, nsjax.WorkPrecision]) -> None:
+    case = CASES[key]
+    figure, axes = plt.subplots(1, 2, figsize=(11, 5.2), layout="constrained", sharey=True)
+    for ax, (name, table) in zip(axes, tables.items()):
+        nsjax.plot.work_precision(table, ax=ax)
+        what = name if name == "state" else f"d state / d {case.parameter}"
+        ax.set_xlabel(f"error of {what} at t = {case.t1:g} (largest component)")
+    figure.savefig(f"{out}_{key}.png", dpi=120)
+    plt.close(figure)
+
+
+def draw_again(out: str, systems: list[str]) -> None:
+    with open(f"{out}.json") as file:
+        rows = json.load(file)
+    for key in systems:
+        found = {name: rows[f"{key} {name}"] for name in quantities(CASES[key])}
+        tables = {k: nsjax.WorkPrecision(tuple(Row(**r) for r in t["rows"]), t["doubt"]) for k, t in found.items()}
+        draw(out, key, tables)
+
+
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -105,22 +127,21 @@ def main() -> None:
     parser.add_argument("--tolerances", nargs="*", type=float, default=[1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", help="where to write the numbers and the pictures")
+    parser.add_argument("--draw", action="store_true", help="draw the pictures from <out>.json")
     args = parser.parse_args()
+    if args.draw:
+        draw_again(args.out, args.systems)
+        return
     rows: dict[str, Any] = {"machine": machine()}
     for key in args.systems:
-        case = CASES[key]
-        figure, axes = plt.subplots(1, 2, figsize=(11, 5.2), layout="constrained", sharey=True)
-        for ax, (name, quantity) in zip(axes, quantities(case).items()):
+        case, tables = CASES[key], {}
+        for name, quantity in quantities(case).items():
             chosen = {k: m for k, m in methods(key).items() if name == "state" or "band" not in k}
-            table = compare(case.system, quantity, chosen, args)
-            print(f"\n### {key}, {name} at t = {case.t1:g}\n\n{table}", flush=True)
-            rows[f"{key} {name}"] = dict(doubt=table.doubt, rows=[r._asdict() for r in table.rows])
-            nsjax.plot.work_precision(table, ax=ax)
-            what = name if name == "state" else f"d state / d {case.parameter}"
-            ax.set_xlabel(f"error of {what} at t = {case.t1:g} (largest component)")
+            tables[name] = compare(case.system, quantity, chosen, args)
+            print(f"\n### {key}, {name} at t = {case.t1:g}\n\n{tables[name]}", flush=True)
+            rows[f"{key} {name}"] = dict(doubt=tables[name].doubt, rows=[r._asdict() for r in tables[name].rows])
         if args.out:
-            figure.savefig(f"{args.out}_{key}.png", dpi=120)
-        plt.close(figure)
+            draw(args.out, key, tables)
     if "2.4" in args.systems:
         counted = evaluations()
         print(f"\n### 2.4, evaluations of the right-hand side\n\n{counted}", flush=True)

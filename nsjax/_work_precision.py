@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._numerics._progress import Counting, ProgressMeter, QUIET
+from ._numerics._tables import frame
 from ._numerics._text import shown
 from ._types import Scalar, Y
 from .flow._solution import Solution
@@ -78,6 +79,15 @@ class WorkPrecision(NamedTuple):
 
     rows: tuple[Row, ...]
     doubt: float
+
+    def to_dataframe(self) -> Any:
+        """A row for each method and tolerance, with the fields of `rows`.
+
+        **Returns:** a `pandas.DataFrame`: `pip install nsjax[data]`.
+        """
+        table = {name: np.array([getattr(row, name) for row in self.rows], dtype=object) for name in Row._fields}
+        numbers = {name: x.astype(float) for name, x in table.items() if name not in ("method", "failure")}
+        return frame("WorkPrecision.to_dataframe", (table | numbers).items())
 
     def __str__(self) -> str:
         counted = any(r.evaluations is not None for r in self.rows)

@@ -22,6 +22,7 @@ from matplotlib.lines import Line2D
 import nsjax
 from nsjax import gallery, plot
 from nsjax.gallery import Motion
+from nsjax.plot._work_precision import method_colors
 
 
 HERE = pathlib.Path(__file__).parent
@@ -73,10 +74,12 @@ def orbit_panel(ax):
 
 def accuracy_panel(ax):
     table = json.loads((HERE.parents[1] / "benchmarks" / "work_precision.json").read_text())["2.4 state"]
+    colors = method_colors(METHODS)
     for (method, name), marker in zip(METHODS.items(), "o^sv"):
         rows = [row for row in table["rows"] if row["method"] == method and not row["failure"]]
         error = np.maximum([row["error"] for row in rows], table["doubt"])
-        ax.loglog(error, [1e3 * row["seconds"] for row in rows], marker + "-", markersize=4, label=name)
+        style = dict(color=f"C{colors[method]}", markersize=4, label=name)
+        ax.loglog(error, [1e3 * row["seconds"] for row in rows], marker + "-", **style)
     low = 1e-13
     ax.axvspan(low, table["doubt"], color="0.92", zorder=0)
     ax.set_xlim(3, low)

@@ -9,10 +9,11 @@ from .._version import __version__
 from ._cache import cache_folder
 from ._diagrams import DIAGRAMS
 from ._job import unknown, UsageError
-from ._scorecard import EQUILIBRIA, NUMBERS_OF, ORBITS
+from ._scorecard import EQUILIBRIA, FAMILIES, NUMBERS_OF, ORBITS
 
 
 USAGE = 2  # exit status
+SECTIONS = (NUMBERS_OF, *EQUILIBRIA, *ORBITS, *FAMILIES)  # of the scorecard
 
 
 class _Parser(argparse.ArgumentParser):
@@ -34,8 +35,8 @@ def parse(argv: list[str]) -> argparse.Namespace:
     if getattr(args, "json", None) not in (None, "-"):
         _check_file(pathlib.Path(args.json), "--json")
     for section in getattr(args, "sections", ()):
-        if section not in (NUMBERS_OF, *EQUILIBRIA, *ORBITS):
-            raise unknown("section", section, (NUMBERS_OF, *EQUILIBRIA, *ORBITS))
+        if section not in SECTIONS:
+            raise unknown("section", section, SECTIONS)
     return args
 
 
@@ -69,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     card.add_argument(
         "sections", nargs="*", metavar="SECTION",
-        help=f"only some: numbers, {', '.join([*EQUILIBRIA, *ORBITS])}",
+        help=f"only some: {', '.join(SECTIONS)} (the last three take minutes each, and are not among all)",
     )  # fmt: skip
     for command in (run, orbit, follow, card):
         add = command.add_argument

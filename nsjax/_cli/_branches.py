@@ -116,21 +116,20 @@ def _corners(branch: OrbitBranch, shown: Callable[[OrbitBifurcation], str]) -> l
 def _circles(corners: Sequence[tuple[OrbitBifurcation, Followed]], labels: dict[Any, str]) -> Any:
     columns = min(len(corners), 3)
     rows = -(-len(corners) // columns)
-    drawn = figure(4.2 * columns, 0.6 + 4.2 * rows)
+    drawn = figure(4.2 * columns, 0.6 + 5.0 * rows)
     drawn.set_layout_engine("compressed")  # because the axes have equal units
     axes = drawn.subplots(rows, columns, squeeze=False).ravel()
     for ax in axes[len(corners) :]:
         ax.remove()
     for (special, found), ax in zip(corners, axes):
-        plot.multiplier_circle(special, ax=ax)
-        (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
-        ax.set(xlim=(max(left, -FAR), min(right, FAR)), ylim=(max(low, -FAR), min(high, FAR)))
+        # The same square for all, or as far as there is something.
+        ends = np.abs(np.concatenate([np.ravel(side) for side in special.multipliers]))
+        reach = min(FAR, max(1.2, 1.1 * float(ends.max())))
+        ax.set(xlim=(-reach, reach), ylim=(-reach, reach))
+        plot.multiplier_circle(special, ax=ax, labels=labels)
         symbol, _, unit = labels.get(special.parameter, special.parameter).partition(" [")
         letter = found.family.letter(special)
         words = ([letter] if letter else []) + [f"{symbol} = {special.value:.6g} {unit.removesuffix(']')}".strip()]
         name = special.name.partition(",")[0].partition(":")[0]
-        ax.annotate(
-            f"{', '.join(words)}\n{name}", (0.5, 0.0), (0, -38), xycoords="axes fraction", textcoords="offset points",
-            ha="center", va="top", fontsize="small",
-        )  # fmt: skip
+        ax.set_xlabel(f"{ax.get_xlabel()}\n{', '.join(words)}\n{name}")
     return drawn

@@ -1,5 +1,7 @@
-"""Units of parameters and state components, read from the comments beside them: `x: Array  # displacement [m]`."""
+"""Units of parameters and state components: the metadata of a field, or the comment beside it,
+`x: Array  # displacement [m]`."""
 
+import dataclasses
 import inspect
 import re
 from collections import Counter
@@ -16,7 +18,8 @@ class Note(NamedTuple):
 
 
 def notes(cls: type) -> dict[str, Note]:
-    """What the comments of a class and its bases say of its fields; nothing where there is no source."""
+    """What is said of the fields of a class: by the metadata `unit` and `meaning` of a field, or by the comments of the
+    class and its bases, which are not there where there is no source."""
     found = {}
     for base in reversed(cls.__mro__):
         try:
@@ -24,6 +27,10 @@ def notes(cls: type) -> dict[str, Note]:
         except (OSError, TypeError):  # built in, or typed at a prompt
             continue
         found |= {name: Note(meaning, unit or "") for name, meaning, unit in _FIELD.findall(source)}
+    for field in dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ():
+        told = {key: str(field.metadata[key]) for key in Note._fields if key in field.metadata}
+        if told:
+            found[field.name] = found.get(field.name, Note())._replace(**told)
     return found
 
 

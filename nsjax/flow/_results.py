@@ -156,10 +156,10 @@ def _raise_if_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return _raise_if((tree, verdict)), _raise_if((moves, verdict)) if jax.tree.leaves(moves) else moves
 
 
-def result_names(result: RESULTS) -> np.ndarray:
-    """The name of each."""
+def result_names(result: Any) -> np.ndarray:
+    """The name of each; of `RESULTS`, or of the integers by which it is kept."""
     names = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
-    codes = np.asarray(result._value)
+    codes = np.asarray(getattr(result, "_value", result))
     return np.array([names[int(i)] for i in np.ravel(codes)], dtype=object).reshape(codes.shape)
 
 

@@ -18,7 +18,7 @@ from .._numerics._text import between, components, counted, positive, shown
 from .._types import Y
 from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
-from ..flow._results import RESULTS
+from ..flow._results import result_names
 from ..sweeps._devices import Devices, devices_of
 from ..sweeps._lanes import default_chunk, even_chunks
 from ..system._parameter import parameter_path
@@ -87,9 +87,8 @@ class AttractorChart(eqx.Module):
 
     def kinds(self) -> np.ndarray:
         """In words, of each: `period 2`, `chaos`, `undecided`, or the name of its result."""
-        names = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
         rest = np.where(self.chaotic, "chaos", np.where(self.failed, "", "undecided")).astype(object)
-        rest[self.failed] = [names[int(code)] for code in self.result[self.failed]]
+        rest[self.failed] = result_names(self.result[self.failed])
         return np.where(self.periods > 0, [[f"period {p}" for p in row] for row in self.periods], rest)
 
     def __str__(self) -> str:

@@ -14,11 +14,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._numerics._progress import Counting, ProgressMeter, QUIET
-from .._numerics._text import positive, shown
+from .._numerics._tables import frame
+from .._numerics._text import components, positive, shown
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
-from ..flow._results import is_okay, RESULTS
+from ..flow._results import is_okay, result_names, RESULTS
 from ..orbits._orbit import Orbit
 from ..sweeps._lanes import CHUNK
 from ..system._system import arrays_of, System
@@ -52,6 +53,17 @@ class Basins(eqx.Module):
     iterates: Int[np.ndarray, "..."]
     starts: Y
     result: Int[np.ndarray, "..."]
+
+    def to_dataframe(self) -> Any:
+        """A row for each start: the components of its state, the number of its attractor (`attractor`), `iterates`, and
+        the name of its `result`.
+
+        **Returns:** a `pandas.DataFrame`: `pip install nsjax[data]`.
+        """
+        results = np.ravel(result_names(self.result))
+        columns = {name: np.ravel(x) for name, x in components(self.starts, np.ndim(self.labels)).items()}
+        told = dict(attractor=np.ravel(self.labels), iterates=np.ravel(self.iterates), result=results)
+        return frame("Basins.to_dataframe", [*columns.items(), *told.items()])
 
     def fractions(self) -> Float[np.ndarray, " attractors"]:
         """The part of the starts that leads to each attractor."""

@@ -3,9 +3,10 @@
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
+from jax.core import Tracer
 
 from ._contact import Contact, Rigid
-from ._direction import Direction, Function
+from ._direction import Combination, Direction, Function
 from ._friction import Friction
 from ._words import felt, number
 
@@ -20,6 +21,7 @@ APART = 2.6  # from one block to the next, middle to middle
 STEP = 0.46  # from one element to the next, between the same bodies
 LINE = dict(color="0.15", linewidth=1.2, solid_capstyle="round")
 TEXT = dict(fontsize="small", color="0.15", ha="center")
+CLEAR = dict(facecolor="white", edgecolor="none", pad=0.6)  # of the lines of others
 
 
 def sketch(scene: "Scene", *, ax: "Axes | None" = None) -> "Axes":
@@ -98,7 +100,7 @@ class _Drawing:
             y = self.high + 0.16
             ax.plot([middle, middle], [self.high, y + 0.06], **LINE | dict(linewidth=0.9))
             _arrow(ax, (middle, y), (middle + 0.42, y), 0.9)
-            ax.text(middle + 0.5, y, name, va="center", **TEXT | dict(ha="left", style="italic"))
+            ax.text(middle + 0.5, y, name, va="center", bbox=CLEAR, **TEXT | dict(ha="left", style="italic"))
             self._draw_sides(ax, i, middle)
             self._draw_ground(ax, i, middle)
             for n, (label, _) in enumerate(self.forces.get(i, []), 1):
@@ -147,17 +149,22 @@ class _Drawing:
         for i in blocks:
             ax.plot([i * APART, x], [self.high, y], **LINE | dict(linewidth=0.8, linestyle=(0, (4, 3)), zorder=0))
         ax.plot([x], [y], marker="o", markersize=7, markerfacecolor="white", **LINE)
-        clear = dict(facecolor="white", edgecolor="none", pad=0.6)  # of the lines of others
-        ax.text(x + 0.14, y, label, va="center", bbox=clear, **TEXT | dict(ha="left"))
+        ax.text(x + 0.14, y, label, va="center", bbox=CLEAR, **TEXT | dict(ha="left"))
 
 
 def _ends(scene: "Scene", along: Direction) -> dict[str, int] | None:
     """The blocks between which an effect acts, with the signs of the distance; None if it is not of this kind."""
-    if not isinstance(along, Function):
+    if isinstance(along, Function):
+        found: dict[str, Any] = {n: s and s * along.sign for n, s in along.slopes_at(scene.state().q).items()}
+    elif isinstance(along, Combination):
+        found = {n: f if w is None else w for n, w, f in zip(along.names, along.whole, along.factors)}
+    else:
         return along.slopes
-    found = along.slopes_at(scene.state().q)
-    signs = {n: int(s * along.sign) for n, s in found.items() if s in (1, -1)}
-    return signs if len(signs) == len(found) else None
+    if any(s is None or isinstance(s, Tracer) for s in found.values()):
+        return None
+    # A lever pulls the same way, whatever its ratio; between two blocks there is no symbol for it.
+    sizes = {abs(float(s)) for s in found.values()}
+    return {n: int(np.sign(float(s))) for n, s in found.items()} if len(sizes) == 1 and 0 not in sizes else None
 
 
 def _mass_text(scene: "Scene", i: int) -> str:

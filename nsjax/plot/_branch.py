@@ -11,7 +11,7 @@ from ..continuation.equilibria._bifurcation import Bifurcation
 from ..continuation.equilibria._branch import Branch
 from ..orbits._orbit import Orbit
 from ..system._parameter import get_parameter, parameter_path
-from ._diagram import LINE, mark, stretches, UNSTABLE, wording, write_names
+from ._diagram import begun, LINE, mark, stretches, UNSTABLE, wording, write_names
 from ._style import axes_or_new, axis_label, Labels, legend as add_legend
 
 
@@ -60,15 +60,15 @@ def bifurcation_diagram(
     for one in branch.branches:
         stretches(ax, one.values, _measured(measure, one.ys), one.stable, _styles("equilibrium"), LINE | style)
     for family in orbits:
-        _periodic(ax, family, branch.parameter, measure)
+        _periodic(ax, family, branch, measure)
     points = {id(special): special for one in branch.branches for special in one.special}
     places = [_point(ax, special, measure, names) for special in points.values()]
-    write_names(ax, [place for place in places if place[2]])
     name = measure if isinstance(measure, str) else "measure"
     ax.set_xlabel(axis_label(labels, branch.parameter))
     ax.set_ylabel(axis_label(labels, name))
     if legend:
         add_legend(ax)
+    write_names(ax, [place for place in places if place[2]])
     return ax
 
 
@@ -83,19 +83,44 @@ def _measured(measure: str | Callable[[Any], Any], ys: Any) -> np.ndarray:
     return np.asarray(jax.vmap(measure)(ys))
 
 
-def _periodic(ax: "Axes", family: Sequence[Orbit], parameter: str, measure: str | Callable[[Any], Any]) -> None:
+def _periodic(ax: "Axes", family: Sequence[Orbit], branch: Branch, measure: str | Callable[[Any], Any]) -> None:
     # Extremes of samples, where `Orbit.maximum` is exact: on an arc of half a wave they are off by 3e-4 of the
     # amplitude at most, which is not visible, and the exact program takes several times as long to compile.
-    values, most, least, stable = [], [], [], []
+    rows = []
     for orbit in family:
         path = jax.tree.map(lambda x: x.reshape(-1), orbit.path().y)
         along = _measured(measure, path)
-        values.append(float(get_parameter(orbit.system, parameter_path(orbit.system, parameter))))
-        most.append(np.nanmax(along))
-        least.append(np.nanmin(along))
-        stable.append(bool(orbit.stable))
+        value = float(get_parameter(orbit.system, parameter_path(orbit.system, branch.parameter)))
+        rows.append((value, np.nanmax(along), np.nanmin(along), float(orbit.stable)))
+    values, most, least, stable = np.array(rows).reshape(-1, 4).T
+    values, most, least, stable = _from_hopf(values, most, least, stable, branch, measure)
     for extreme in most, least:
-        stretches(ax, np.array(values), np.array(extreme), np.array(stable), _styles("periodic orbit"), PERIODIC)
+        stretches(ax, values, extreme, stable > 0, _styles("periodic orbit"), PERIODIC)
+
+
+def _from_hopf(
+    values: np.ndarray, most: np.ndarray, least: np.ndarray, stable: np.ndarray, branch: Branch,
+    measure: str | Callable[[Any], Any],
+) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """With the Hopf point at which the orbits shrink to an equilibrium, and what lies between, at the end where that
+    is."""
+    sizes = most - least
+    hopf = [special for special in branch.special_points if "Hopf" in special.kind]
+    if not hopf or len(values) < 2 or not min(sizes[0], sizes[-1]) < 0.5 * sizes.max():
+        return values, most, least, stable
+    way = 1 if sizes[0] <= sizes[-1] else -1
+    values, most, least, stable, sizes = (array[::way] for array in (values, most, least, stable, sizes))
+    nearest = min(hopf, key=lambda special: abs(special.value - values[0]))
+    height = _height(nearest, measure)
+    if not least[0] <= height <= most[0]:
+        return values, most, least, stable
+    first = np.insert(values, 0, nearest.value), np.insert(sizes, 0, 0.0)
+    drawn = []
+    for extreme in most, least:
+        x, y = begun(first[0][:4], np.insert(extreme, 0, height)[:4], first[1][:4])
+        drawn.append(np.concatenate([[height], y, extreme]))
+        x = np.concatenate([[nearest.value], x, values])
+    return x, *drawn, np.concatenate([np.full(len(x) - len(values), stable[0]), stable])
 
 
 def heights_of(branch: Branch, measure: Measure) -> np.ndarray:

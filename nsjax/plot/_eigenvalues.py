@@ -5,14 +5,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..setvalued._eigenvalue_crossings import EigenvaluePath
-from ._style import axes_or_new, axis_label, Labels, legend
+from ._diagram import write_names
+from ._style import axes_or_new, axis_label, Labels, legend, once
 
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-
-PLATE = dict(facecolor="white", edgecolor="none", alpha=0.75, pad=1.0)  # behind what is written across lines
 
 
 def eigenvalue_path(path: EigenvaluePath, *, ax: "Axes | None" = None, labels: Labels = None) -> "Axes":
@@ -23,7 +21,8 @@ def eigenvalue_path(path: EigenvaluePath, *, ax: "Axes | None" = None, labels: L
 
     - `path`: from `nsjax.setvalued.eigenvalue_path`.
     - `ax`: where to draw; by default a new figure.
-    - `labels`: for the axes, as `{"Re": "Re λ [1/s]", "Im": "Im λ [1/s]"}`; by default without units.
+    - `labels`: for the axes, as `{"Re": "Re λ [1/s]", "Im": "Im λ [1/s]"}`; by default without units. And for the
+        ends, as `{"q = 0": "q = 0: μ < 0", "q = 1": "q = 1: μ > 0"}`.
 
     **Returns:** the axes.
     """
@@ -40,8 +39,8 @@ def eigenvalue_path(path: EigenvaluePath, *, ax: "Axes | None" = None, labels: L
         ax.plot(branch.real, branch.imag, color=f"C{i % 10}", linewidth=1.8)
     for at, face, name in ((0, "white", "q = 0"), (-1, "black", "q = 1")):
         style = dict(marker="o", linestyle="none", markersize=6, markeredgecolor="black", markerfacecolor=face)
-        ax.plot(values[at].real, values[at].imag, label=name, zorder=4, **style)
-    _draw_crossings(ax, path)
+        ax.plot(values[at].real, values[at].imag, label=axis_label(labels, name), zorder=4, **style)
+    names = _draw_crossings(ax, path)
     if path.multipliers:
         ax.set_aspect("equal")
     ax.margins(0.08)
@@ -49,24 +48,19 @@ def eigenvalue_path(path: EigenvaluePath, *, ax: "Axes | None" = None, labels: L
     ax.set_xlabel(axis_label(labels, "Re", f"Re λ{unit}"))
     ax.set_ylabel(axis_label(labels, "Im", f"Im λ{unit}"))
     legend(ax)
+    write_names(ax, names)
     return ax
 
 
-def _draw_crossings(ax: "Axes", path: EigenvaluePath) -> None:
+def _draw_crossings(ax: "Axes", path: EigenvaluePath) -> list[tuple[float, float, str]]:
+    """Marks them, and says what is to be written beside which place."""
     cross = dict(marker="x", linestyle="none", markersize=8, markeredgewidth=2.0, color="C3", zorder=5)
-    texts: dict[tuple[float, float], tuple[list[str], bool]] = {}
+    texts: dict[tuple[float, float], list[str]] = {}
     for c in path.crossings:
         if c.until != c.q:  # it stays on the axis, and is seen there
             continue
-        k = int(np.argmin(np.abs(path.q - c.q)))
-        around = path.eigenvalues[[max(k - 1, 0), min(k + 1, len(path.q) - 1)]]
         for z in dict.fromkeys([c.eigenvalue, c.eigenvalue.conjugate()]):
-            ax.plot([z.real], [z.imag], label="crosses" if c.direction else "touches, or crosses both ways", **cross)
-            way = np.diff(around[:, np.argmin(np.abs(path.eigenvalues[k] - z))])[0]
-            place = (round(z.real, 9), round(z.imag, 9))
-            texts.setdefault(place, ([], bool(way.real * way.imag > 0)))[0].append(f"{c.q:.4g}")
-    for place, (qs, rising) in texts.items():
-        # On the side of the path where it does not go.
-        offset = dict(xytext=(8, -4), va="top") if rising else dict(xytext=(8, 5), va="bottom")
-        text = "q = " + ", ".join(dict.fromkeys(qs))
-        ax.annotate(text, place, textcoords="offset points", fontsize="small", bbox=PLATE, **offset)
+            label = "crosses" if c.direction else "touches, or crosses both ways"
+            ax.plot([z.real], [z.imag], label=once(ax, label), **cross)
+            texts.setdefault((round(z.real, 9), round(z.imag, 9)), []).append(f"{c.q:.4g}")
+    return [(*place, "q = " + ", ".join(dict.fromkeys(qs))) for place, qs in texts.items()]

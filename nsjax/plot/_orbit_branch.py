@@ -12,10 +12,10 @@ from ..continuation.orbits._bifurcation import OrbitBifurcation
 from ..continuation.orbits._branch import OrbitBranch
 from ..derivatives._floquet import trivial
 from ..setvalued._eigenvalue_crossings import eigenvalue_path as path_between
-from ._diagram import LINE, mark, stretches, UNSTABLE, wording, write_names
+from ._diagram import begun, LINE, mark, stretches, UNSTABLE, wording, write_names
 from ._eigenvalues import eigenvalue_path
 from ._path import chosen
-from ._style import axes_or_new, axis_label, Labels, legend as add_legend
+from ._style import axes_or_new, axis_label, Labels, legend as add_legend, once
 
 
 if TYPE_CHECKING:
@@ -76,17 +76,17 @@ def orbit_diagram(
     ax = axes_or_new(ax)
     heights = [measured(measure, one) for one in branch.branches]
     for one, height in zip(branch.branches, heights):
-        stretches(ax, one.values, height, _kinds(one), STYLES, LINE)
+        stretches(ax, *_line(one, height), STYLES, LINE)
     words = []
     for special, k, i in special_points(branch):
         height = float(heights[k][i])
         mark(ax, special.value, height, special.discontinuous, special.is_bifurcation)
         words.append((special.value, height, _words(names, special)))
-    write_once(ax, words)
     ax.set_xlabel(axis_label(labels, branch.parameter))
     ax.set_ylabel(_measure_label(measure, branch, labels))
     if legend:
         add_legend(ax)
+    write_once(ax, words)
     return ax
 
 
@@ -143,7 +143,7 @@ def multiplier_diagram(
         clip = dict(clip_on=not np.isinf(values).any())
         stretches(ax, x, heights(values), kinds, STYLES, LINE | clip)
     for x, path in jumps:
-        ax.plot(np.full(len(path), x), heights(path), label="jump of the multipliers", **PATH)
+        ax.plot(np.full(len(path), x), heights(path), label=once(ax, "jump of the multipliers"), **PATH)
     for height in (1.0,) if part == "abs" else (-1.0, 1.0):
         ax.axhline(height, color="0.75", linewidth=0.9, zorder=0)
     if any(np.isinf(values).any() for _, values, _ in lines):
@@ -159,18 +159,18 @@ def multiplier_diagram(
         clip = dict(clip_on=not np.isinf(ends).any())
         ax.plot(np.full(len(places), found.value), places, color=color, **HALF, **clip)
         words.append((found.value, float(np.max(places)), _words(names, found)))
-    write_once(ax, words)
     ax.set_xlabel(axis_label(labels, branch.parameter))
     ax.set_ylabel(axis_label(labels, "multiplier", default))
     if legend:
         add_legend(ax)
+    write_once(ax, words)
     return ax
 
 
 def multiplier_circle(bifurcation: OrbitBifurcation, *, ax: "Axes | None" = None, labels: Labels = None) -> "Axes":
     """Draws the path of the set-valued multipliers at a corner in the complex plane, from the one-sided limit of the
     branch that came (q = 0) to that of its continuation (q = 1), with the unit circle and the crossings; Figs. 6.1 and
-    6.2.
+    6.2. The legend says of both on which side of the parameter's value they lie, and whether they are stable.
 
     **Arguments:**
 
@@ -189,7 +189,30 @@ def multiplier_circle(bifurcation: OrbitBifurcation, *, ax: "Axes | None" = None
         raise ValueError("Argument `bifurcation` must have finite multipliers: the way to infinity has no picture.")
     path = path_between(*bifurcation.monodromies, multipliers=True)
     # Those of the point itself: of an autonomous orbit the multiplier 1 stays where it is, but for its rounding.
-    return eigenvalue_path(path._replace(crossings=list(bifurcation.crossings)), ax=ax, labels=labels)
+    path = path._replace(crossings=list(bifurcation.crossings))
+    symbol = axis_label(labels, bifurcation.parameter).partition(" [")[0]
+    names = {f"q = {q}": f"q = {q}: {words}" for q, words in enumerate(_sides(bifurcation, symbol)) if words}
+    return eigenvalue_path(path, ax=ax, labels=names | dict(labels or {}))
+
+
+def _sides(bifurcation: OrbitBifurcation, symbol: str) -> tuple[str, str]:
+    """What lies at either end of the path of multipliers: orbits below or above the parameter's value, stable or not.
+    Empty where that cannot be told."""
+    found = []
+    for side in bifurcation.multipliers:
+        words = {
+            f"{'stable' if half.stable else 'unstable'}, {symbol} {'below' if half.side < 0 else 'above'}"
+            for half in bifurcation.halves
+            if half.laps == 1 and half.side and _alike(half.multipliers, side)
+        }
+        found.append(words.pop() if len(words) == 1 else "")
+    return found[0], found[1]
+
+
+def _alike(first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether multipliers are the same, in whatever order."""
+    far = np.abs(np.asarray(first, complex)[:, None] - np.asarray(second, complex))
+    return far.shape[0] == far.shape[1] and all(np.min(far, axis=k).max() < 1e-5 for k in (0, 1))
 
 
 def measured(measure: Measure, branch: OrbitBranch) -> np.ndarray:
@@ -214,6 +237,21 @@ def _measure_label(measure: Measure, branch: OrbitBranch, labels: Labels) -> str
     (name,) = chosen(components(jax.tree.map(lambda x: x[0], branch.ys)), [measure])
     symbol, bracket, unit = axis_label(labels, name).partition(" [")
     return f"max |{symbol}|{bracket}{unit}"
+
+
+def _line(branch: OrbitBranch, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Parameter, height and key in `STYLES` of what is drawn: the points of a branch, and more next to Hopf points."""
+    values, kinds = branch.values, _kinds(branch)
+    low, high = (np.stack(list(components(leaf, 1).values())) for leaf in (branch.low, branch.high))
+    amplitudes = np.linalg.norm(high - low, axis=0)
+    for special, i in sorted(zip(branch.special, branch.indices), key=lambda pair: -pair[1]):
+        if special.kind == "Hopf" and i in (0, len(branch) - 1) and len(branch) > 1:
+            way = 1 if i == 0 else -1
+            new = begun(*(array[::way][:4] for array in (branch.values, heights, amplitudes)))
+            place = 1 if i == 0 else len(values) - 1
+            values, heights = (np.insert(old, place, add[::way]) for old, add in zip((values, heights), new))
+            kinds = np.insert(kinds, place, np.full(len(new[0]), kinds[1 if i == 0 else -2]))
+    return values, heights, kinds
 
 
 def _kinds(branch: OrbitBranch) -> np.ndarray:

@@ -67,11 +67,11 @@ def parameter_plane(
             text = names(point) if callable(names) else point.name if names else ""
             words.append((float(at[0]), float(at[1]), text))
     ax.margins(0.08, 0.1)
-    write_names(ax, _together(words, np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())))
     ax.set_xlabel(axis_label(labels, first))
     ax.set_ylabel(axis_label(labels, second))
     if legend:
         add_legend(ax)
+    write_names(ax, _together(words, np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())))
     return ax
 
 

@@ -18,7 +18,7 @@ from ..system._relay import relay
 from ..system._sgn import sgn
 from ..system._switch import AbstractSwitch
 from ._path import arcs, chosen, solved
-from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_legend, mode_line
+from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_legend, mode_line, once
 
 
 if TYPE_CHECKING:
@@ -66,9 +66,10 @@ def phase_portrait(
     ax = axes_or_new(ax)
     if unstable:
         style = dict(linestyle=DASHES) | style
-        ax.plot([], [], color="0.35", linestyle=style["linestyle"], label="unstable")
+        ax.plot([], [], color="0.35", linestyle=style["linestyle"], label=once(ax, "unstable"))
     for arc in arcs(sol):
-        ax.plot(arc.y[x], arc.y[y], solid_capstyle="butt", **mode_line(sol.system, arc.mode) | style)
+        own = mode_line(sol.system, arc.mode) | style
+        ax.plot(arc.y[x], arc.y[y], solid_capstyle="butt", **own | dict(label=once(ax, own["label"])))
     if events:
         _draw_events(ax, sol, x, y)
     ax.set_xlabel(axis_label(labels, x))
@@ -86,7 +87,7 @@ def _draw_events(ax: "Axes", sol: Solution, x: str, y: str) -> None:
     before, after = (components(jax.tree.map(lambda l: l[:n], state), ndim=1) for state in log)
     for i in np.flatnonzero((before[x] != after[x]) | (before[y] != after[y])):
         ax.plot([before[x][i], after[x][i]], [before[y][i], after[y][i]], **JUMP)
-    ax.plot(after[x], after[y], label="event" if n else None, **EVENT)
+    ax.plot(after[x], after[y], label=once(ax, "event" if n else None), **EVENT)
 
 
 def _draw_surfaces(ax: "Axes", sol: Solution, x: str, y: str) -> None:
@@ -127,7 +128,7 @@ def _draw_surface(
     line = dict(colors="0.35", linestyles=style, linewidths=1.0)
     contour = ax.contour(x, y, h, levels=[0.0], zorder=1, **line)
     name = switch.name if not isinstance(switch, relay) else f"{switch.name} {'on' if style == '--' else 'off'}"
-    ax.plot([], [], color="0.35", linestyle=style, linewidth=1.0, label=f"{name}: h = 0")
+    ax.plot([], [], color="0.35", linestyle=style, linewidth=1.0, label=once(ax, f"{name}: h = 0"))
     if isinstance(switch, sgn):
         ax.contourf(x, y, h, levels=[h.min() - 1, 0.0], colors=["0.5"], alpha=0.12, zorder=0)
     elif isinstance(switch, impact):

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 Labels = Mapping[Any, str] | None
 
 EVENT = dict(marker="o", linestyle="none", markersize=4.5, markerfacecolor="white", markeredgecolor="black", zorder=4)
+WIDER = 1.15  # than axes may a legend be: their own labels are beside them
 JUMP = dict(color="0.4", linestyle=":", linewidth=1.0, zorder=1)
 
 
@@ -39,11 +40,22 @@ def axis_label(labels: Labels, name: Any, default: str | None = None) -> str:
     return (labels or {}).get(name, name if default is None else default)
 
 
+def once(ax: "Axes", label: str | None) -> str | None:
+    """A label for what is drawn next: itself if nothing in the axes has it yet. Else with an underscore, so that
+    `Axes.legend` does not repeat it."""
+    if label and any(known == label for known in ax.get_legend_handles_labels()[1]):
+        return f"_{label}"
+    return label
+
+
 def legend(ax: "Axes", columns: int = 3) -> None:
-    """A legend above the axes, where it hides nothing; each label once, as it was drawn first."""
+    """A legend above the axes, where it hides nothing; each label once, as it was drawn first. It has at most so many
+    columns, and fewer where they would be wider than the axes."""
     handles, names = ax.get_legend_handles_labels()
     unique = dict(reversed([*zip(names, handles)]))
     unique = {name: unique[name] for name in dict.fromkeys(names)}
-    if unique:
-        place = dict(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, fontsize="small", frameon=False)
-        ax.legend(unique.values(), unique.keys(), **place)
+    place = dict(loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize="small", frameon=False)
+    for count in range(min(columns, len(unique)), 0, -1):
+        drawn = ax.legend(unique.values(), unique.keys(), ncols=count, **place)
+        if drawn.get_window_extent().width <= WIDER * ax.get_window_extent().width:
+            break

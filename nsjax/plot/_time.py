@@ -7,7 +7,7 @@ import numpy as np
 
 from .._numerics._text import components
 from ._path import arcs, chosen, solved
-from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_legend, mode_line
+from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_legend, mode_line, once
 
 
 if TYPE_CHECKING:
@@ -40,7 +40,8 @@ def time_series(
     (name,) = chosen(components(sol.y1), [component])
     ax = axes_or_new(ax)
     for arc in arcs(sol):
-        ax.plot(arc.t, arc.y[name], solid_capstyle="butt", **mode_line(sol.system, arc.mode))
+        own = mode_line(sol.system, arc.mode)
+        ax.plot(arc.t, arc.y[name], solid_capstyle="butt", **own | dict(label=once(ax, own["label"])))
     n = len(sol.events)
     times = np.asarray(sol.events.t[:n])
     log = (sol.events.y_before, sol.events.y_after)
@@ -48,7 +49,7 @@ def time_series(
     for t, low, high in zip(times, before, after):
         if low != high:
             ax.plot([t, t], [low, high], **JUMP)
-    ax.plot(times, after, label="event" if n else None, **EVENT)
+    ax.plot(times, after, label=once(ax, "event" if n else None), **EVENT)
     ax.set_xlabel(axis_label(labels, "t"))
     ax.set_ylabel(axis_label(labels, name))
     if legend:

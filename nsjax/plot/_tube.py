@@ -102,7 +102,7 @@ def perturbation_tube(
         ax.add_collection(face)
         for k in outlined[which[outlined] == i]:
             ax.plot(*images[1 + k].T, color=colour, linewidth=0.8, zorder=1.5)
-    ax.plot(*images[0].T, color="black", linewidth=1.5, zorder=3, label="perturbations")
+    ax.plot(*images[0].T, color="black", linewidth=1.5, zorder=3, label="perturbations (linear)")
     ax.plot(*images[-1].T, color="black", linewidth=2.5, linestyle=(0, (1, 1)), zorder=3, label="one period later")
     phase_portrait(orbit, x, y, ax=ax, labels=labels, surfaces=surfaces, events=events, legend=False)
     if legend:

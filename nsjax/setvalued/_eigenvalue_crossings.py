@@ -166,7 +166,7 @@ def eigenvalue_path(
     while ahead:
         step = ahead[-1] - qs[-1]
         now = pencil.at(ahead[-1])
-        order, clear = _matched(rows[-1], rates * step, now.values, extent)
+        order, clear = _matched(rows[-1], rates * step, now.values, _visible(rows[-1], extent, multipliers))
         if not clear and step > 1e-7:
             ahead.append(qs[-1] + step / 2)
             continue
@@ -183,7 +183,13 @@ def _gaps(values: np.ndarray) -> np.ndarray:
     return np.min(np.abs(values[:, None] - values) + np.diag(np.full(len(values), np.inf)), axis=1)
 
 
-def _matched(before: np.ndarray, moves: np.ndarray, after: np.ndarray, extent: float) -> tuple[np.ndarray, bool]:
+def _visible(values: np.ndarray, extent: float, multipliers: bool) -> np.ndarray:
+    """Over which length the path of each is to be smooth: that of the whole, or for multipliers that of the unit
+    circle, as they may go far beyond."""
+    return np.minimum(extent, 2 + np.abs(values)) if multipliers else np.full(len(values), extent)
+
+
+def _matched(before: np.ndarray, moves: np.ndarray, after: np.ndarray, extent: np.ndarray) -> tuple[np.ndarray, bool]:
     """Which eigenvalue `after` continues which one `before`, that is expected to move by `moves`; and whether that is
     beyond doubt, or too small to be visible."""
     # Nearest first, not the best assignment of all: where the two differ the match is in doubt, and the caller halves

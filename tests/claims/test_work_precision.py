@@ -12,6 +12,7 @@ from models import Motion
 
 import nsjax
 from nsjax import gallery, Method, work_precision
+from nsjax._work_precision import Row
 
 
 def end(system, method):
@@ -74,6 +75,31 @@ def test_picture(table):
     assert ax.get_xlabel() == "error [m]" and "evaluations" in ax.get_ylabel()
     with pytest.raises(ValueError, match="`against` must be"):
         nsjax.plot.work_precision(table, against="time")
+    plt.close("all")
+
+
+def test_table_of_pandas():
+    pytest.importorskip("pandas")
+    rows = (Row("Tsit5", 1e-6, 0.5, 1e-7, 2.0, None, ""), Row("Heun", 1e-6, float("nan"), float("nan"), 1.0, 7, "no"))
+    table = nsjax.WorkPrecision(rows, 0.0).to_dataframe()
+    assert list(table) == list(Row._fields) and list(table["method"]) == ["Tsit5", "Heun"]
+    np.testing.assert_array_equal(table["evaluations"], [np.nan, 7.0])
+    assert list(table["failure"]) == ["", "no"]
+
+
+def test_a_method_has_one_colour():
+    """In whatever order and company; variants of one kind differ in their lines."""
+
+    def drawn(*names):
+        rows = tuple(Row(name, 1e-6, 1.0, 10.0**-e, 0.0, None, "") for name in names for e in (3, 6))
+        ax = nsjax.plot.work_precision(nsjax.WorkPrecision(rows, 0.0), ax=plt.figure().add_subplot())
+        return {line.get_label(): (line.get_color(), line.get_linestyle()) for line in ax.lines}
+
+    first = drawn("events, Tsit5", "events, Dopri8", "band, η = 1e-4", "band, η = 1e-6", "mine")
+    second = drawn("mine too", "band, η = 1e-6", "arctan, ε = 1e4", "events, Dopri8")
+    assert first["events, Dopri8"] == second["events, Dopri8"]
+    assert first["band, η = 1e-4"][0] == first["band, η = 1e-6"][0] == second["band, η = 1e-6"][0]
+    assert len(set(first.values())) == 5 and len(set(second.values())) == 4
     plt.close("all")
 
 

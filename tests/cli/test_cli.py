@@ -5,6 +5,7 @@ import pathlib
 import re
 
 import diffrax as dfx
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -458,6 +459,18 @@ def test_units_are_read_from_comments():
     assert notes(gallery.StickSlip)["c"] == ("damping", "N s/m")
     assert notes(gallery.Motion)["v"].unit == "m/s"
     assert notes(gallery.AttractionSliding)["c"].unit == ""
+    # A field may say it itself, and then the comment does not count.
+    typed = type(
+        "Typed",
+        (gallery.StickSlip,),
+        {
+            "__annotations__": {"c": float, "q": float},
+            "c": eqx.field(default=1.0, metadata=dict(unit="kg/s")),
+            "q": eqx.field(default=1.0, metadata=dict(unit="m^3/s", meaning="flow")),
+        },
+    )
+    assert notes(typed)["c"] == ("damping", "kg/s") and notes(typed)["q"] == ("flow", "m^3/s")
+    assert notes(typed)["k"] == notes(gallery.StickSlip)["k"]
 
 
 @pytest.mark.parametrize(

@@ -1,36 +1,35 @@
 """Branches of periodic orbits of the drillstring (Figs. A.9 to A.12): each special point against scipy's shooting with
 variational equations and saltation matrices."""
 
-import jax
 import numpy as np
 import pytest
 from drillstring import (
+    arcs_of,
+    at,
     B_1,
     BETA,
     C_B,
     CONTACT,
-    DELTA,
     drillstring,
     field,
+    flat,
+    FREE,
+    just_stopping,
     K,
     K_B,
     lap,
     M_A,
     M_F,
-    of_flip,
-    of_fold,
-    of_neimark_sacker,
+    OF_P2,
+    OF_P4,
     R_C,
-    RELEASE,
-    SLIP,
     slope,
+    smooth_point,
     solved,
-    special_point,
-    STOP,
-    T_0,
-    whirl,
+    TOUCH,
+    touching,
+    whirl_of_p1,
 )
-from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import nsjax
@@ -40,31 +39,7 @@ from nsjax.gallery import TwistedWhirl
 
 pytestmark = pytest.mark.slow
 
-TESTS = {"fold": of_fold, "flip": of_flip, "Neimark-Sacker": of_neimark_sacker}
-FREE, TOUCH = (-1, 1, 1), (1, 1, 1)
 OMEGA_F = np.sqrt((K + B_1 * R_C**2) / (M_F / 4 - M_F * BETA / 2 + M_A * BETA**2 / 4))  # r = R_c in (A.20)
-
-
-def arcs_of(branch, i):
-    """The modes of an orbit from its base point on, and what ends each."""
-    arcs = []
-    for segment in branch.segments[i]:
-        wall, roll, bit = segment.mode
-        event = None
-        if segment.ends == "wall":
-            event = CONTACT if wall < 0 else RELEASE
-        elif segment.ends == "bit":
-            event = SLIP if bit == 0 else STOP
-        arcs.append(((wall, 1 if wall < 0 else roll, bit), event))
-    return arcs
-
-
-def flat(tree):
-    return np.array([float(x) for x in jax.tree.leaves(tree)])
-
-
-def at(ys, i):
-    return flat(jax.tree.map(lambda x: x[i], ys))
 
 
 def alike(found, want, tol):
@@ -80,9 +55,7 @@ def check(branch, kind, value):
     (i,) = [i for i, s in zip(branch.indices, branch.special) if s.kind == kind and abs(s.value - value) < 1e-5]
     special = branch.special[branch.indices.index(i)]
     assert not special.discontinuous
-    _, period, omega, rho = special_point(
-        at(branch.ys, i), branch.periods[i], branch.values[i], arcs_of(branch, i), TESTS[kind]
-    )
+    _, period, omega, rho = smooth_point(branch, i, kind)
     np.testing.assert_allclose(special.value, omega, atol=1e-8)
     np.testing.assert_allclose(special.period, period, rtol=1e-7)
     # At a fold two of them lie as far from 1 as the root of a rounding error.
@@ -91,17 +64,6 @@ def check(branch, kind, value):
     mine = np.asarray(special.multipliers[0])
     mine = np.delete(mine, np.argsort(np.abs(mine - 1))[: len(ones)])
     alike(mine, rest, 1e-5 if kind == "fold" else 1e-6)  # where the state is known to the root of a rounding error
-
-
-def touching(y, period, omega):
-    """The orbit without contact that touches the stator: state there (u = 0, r = R_c), period, parameter."""
-
-    def residual(z):
-        start = np.array([1.0, 0.0, *z[:3]])
-        return lap(start, z[3], z[4], [(FREE, None)])[0] - start
-
-    z = solved(residual, [*y[2:], period, omega])
-    return np.array([1.0, 0.0, *z[:3]]), z[3], z[4]
 
 
 def jump_of_contact(y, omega, u=1e-7):
@@ -277,32 +239,6 @@ def test_special_points_of_p4_and_p3(p4, kind, value):
     check(p4, kind, value)
 
 
-def whirl_of_p1(omega):
-    """The largest modulus of the multipliers of a small whirl while the bit slips to and fro, by scipy: the rotor's
-    equation is linear in the complex plane, and its coefficients follow the bit."""
-
-    def equations(t, x, side):
-        phi, w, (z, v) = x[0].real, x[1].real, x[2:].reshape(2, 2)
-        small = 1e-150  # whose square is zero
-        a = [whirl(small * one, small * rate, omega + w, 0.0)[0] / small for one, rate in zip(z, v)]
-        return np.array([w, -phi - side * T_0 / (1 + DELTA * side * (omega + w)), *v, *a], complex)
-
-    def stands(t, x, side):
-        return side * (x[1].real + omega)
-
-    stands.terminal, stands.direction = True, -1
-    phi = -0.25
-    for _ in range(12):  # the orbit attracts
-        x = np.array([phi, -omega, 1, 0, 0, 1], complex)
-        for side in (1, -1):
-            arc = solve_ivp(
-                equations, (0, 30), x, "DOP853", events=stands, args=(side,), first_step=1e-3, rtol=1e-12, atol=1e-14
-            )
-            x = arc.y[:, -1]
-        phi = x[0].real
-    return np.max(np.abs(np.linalg.eigvals(x[2:].reshape(2, 2))))
-
-
 def test_p2_is_born_at_the_neimark_sacker_point_of_p1(p4):
     """Where a whirl about the middle neither grows nor decays; in polar coordinates P2 just ends there."""
     born = brentq(lambda omega: whirl_of_p1(omega) - 1, 2.2, 2.3, xtol=1e-12)
@@ -335,20 +271,11 @@ def test_p3_begins_where_p2_touches_the_stator(p4):
     """The discontinuous flip: a contact of no duration, with the multipliers on both sides of it."""
     special = next(s for s in p4.special if s.kind == "flip" and s.discontinuous)
     assert special.count == ((1,), (1, 2)) and special.surfaces == ("wall",)
-    # P2 from where it touches: slip forwards, backwards, stick, slip forwards.
-    arcs = [(FREE, STOP), ((-1, 1, -1), STOP), ((-1, 1, 0), SLIP), (FREE, None)]
-
-    def residual(z):
-        start = np.array([1.0, 0.0, *z[:3]])
-        return lap(start, z[3], z[4], arcs)[0] - start
-
     i = p4.indices[p4.special.index(special)]
-    guess = flat(special.y)
-    z = solved(residual, [*guess[2:], special.period, special.value])
-    np.testing.assert_allclose([special.period, special.value], z[3:], atol=1e-8)
-    y = np.array([1.0, 0.0, *z[:3]])
-    free = lap(y, z[3], z[4], arcs)[1]
-    touched = free @ jump_of_contact(y, z[4])
+    y, period, omega = touching(flat(special.y), special.period, special.value, OF_P2)
+    np.testing.assert_allclose([special.period, special.value], [period, omega], atol=1e-8)
+    free = lap(y, period, omega, OF_P2)[1]
+    touched = free @ jump_of_contact(y, omega)
     for mine, want in zip(special.multipliers, (touched, free)):
         alike(mine, np.linalg.eigvals(want), 1e-6)
     assert [c.kind for c in special.crossings] == ["-1"] and cross(special, touched, free)
@@ -360,30 +287,7 @@ def test_p4_begins_where_the_bit_no_more_sticks(p4):
     special = next(s for s in p4.special if s.kind == "fold" and s.discontinuous)
     assert special.surfaces == ("bit",) and special.count == ((), (1, 1))
     i = p4.indices[p4.special.index(special)]
-    j = next(j for j in (i, i + 1) if len(p4.segments[j]) <= 4)
-    arcs = [((-1, 1, 1), CONTACT), (TOUCH, RELEASE), (FREE, None)]
-    y, period = at(p4.ys, j), p4.periods[j]
-    # On the orbit from its lowest speed on: w = -ω there, and w' = 0.
-    stop = solve_ivp(
-        lambda t, y: field(y, special.value, FREE), (0, 6), lap(y, 2.7, special.value, arcs)[0], "DOP853",
-        events=_slowest(special.value), rtol=1e-12, atol=1e-13,
-    )  # fmt: skip
-    guess = stop.y_events[0][0]
-
-    def residual(z):
-        start = np.array([*z[:4], -z[5]])
-        return np.append(lap(start, z[4], z[5], arcs)[0] - start, field(start, z[5], FREE)[4])
-
-    z = solved(residual, [*guess[:4], period, special.value])
-    np.testing.assert_allclose([special.period, special.value], z[4:], atol=1e-8)
-    start = np.array([*z[:4], -z[5]])
-    free = lap(start, z[4], z[5], arcs)[1]
+    start, period, omega = just_stopping(p4, i, special)
+    np.testing.assert_allclose([special.period, special.value], [period, omega], atol=1e-8)
+    free = lap(start, period, omega, OF_P4)[1]
     alike(special.multipliers[0], np.linalg.eigvals(free), 1e-6)
-
-
-def _slowest(omega):
-    def event(t, y):
-        return field(y, omega, FREE)[4]
-
-    event.terminal, event.direction = True, 1
-    return event

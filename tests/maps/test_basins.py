@@ -160,3 +160,15 @@ def test_picture():
         nsjax.plot.basins(nsjax.maps.Basins(labels[0], points, labels[0], Pair(x[0], z[0]), labels[0]))
     with pytest.raises(ValueError, match="second axis"):
         nsjax.plot.basins(nsjax.maps.Basins(labels, points, labels, Pair(z, x), labels))
+
+
+def test_basins_as_a_table():
+    pytest.importorskip("pandas")
+    labels, failed = np.array([[0, 1], [-1, -2]]), int(nsjax.RESULTS.max_steps_reached._value)
+    x, z = np.array([[0.0, 1.0], [2.0, 3.0]]), np.array([[4.0, 5.0], [6.0, 7.0]])
+    points = (Pair(np.zeros(1), np.zeros(1)), Pair(np.ones(1), np.ones(1)))
+    found = nsjax.maps.Basins(labels, points, 3 + labels, Pair(x, z), np.array([[0, 0], [0, failed]]))
+    rows = found.to_dataframe()
+    assert list(rows) == ["x", "z", "attractor", "iterates", "result"]
+    np.testing.assert_array_equal(rows[["x", "z", "attractor"]], [[0, 4, 0], [1, 5, 1], [2, 6, -1], [3, 7, -2]])
+    assert list(rows["result"]) == ["successful"] * 3 + ["max_steps_reached"]

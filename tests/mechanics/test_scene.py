@@ -166,6 +166,17 @@ def test_sketches_are_drawn(scene):
     plt.close("all")
 
 
+@pytest.mark.parametrize("factor", [-1, -1.0, -2.0])
+def test_a_stop_on_the_right_is_drawn_as_one(factor):
+    """Whatever number the direction is written with: to the right of the block, and no circle tied to it."""
+    scene = Scene(dict(x=1.0), wall=Contact({"x": factor}, Rigid(e=0.8), gap=1.0))
+    ax = scene.sketch()
+    (name,) = (text for text in ax.texts if text.get_text() == "wall")
+    assert name.get_position()[0] > 0.5
+    assert not any(line.get_marker() == "o" or line.get_linestyle() == "--" for line in ax.lines)
+    plt.close("all")
+
+
 def test_a_sketch_of_everything():
     scene = Scene(
         ["a", "b"],

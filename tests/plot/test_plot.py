@@ -239,9 +239,9 @@ def test_perturbation_tube():
     orbit = stable()
     ax = plot.perturbation_tube(orbit, radius=(0.1, 0.05), labels={"x": "x [m]", "v": "v [m/s]"})
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "v [m/s]")
-    assert legend_names(ax)[:2] == ["perturbations", "one period later"]
+    assert legend_names(ax)[:2] == ["perturbations (linear)", "one period later"]
     base, shape = np.array(orbit.y0), np.array([0.1, 0.05])
-    first, last = drawn(ax, "perturbations") - base, drawn(ax, "one period later") - base
+    first, last = drawn(ax, "perturbations (linear)") - base, drawn(ax, "one period later") - base
     np.testing.assert_allclose(np.linalg.norm(first / shape, axis=1), 1.0, atol=1e-12)
     np.testing.assert_allclose(last, first @ np.asarray(orbit.monodromy).T, atol=1e-8)
     # Liouville: up to the catch the area shrinks by exp(-c t / m); from then on there is none.
@@ -267,7 +267,7 @@ def test_perturbation_tube_takes_axes_and_components():
     assert 50 <= len(images(ax)) <= 53 and sum(line.get_linewidth() == 0.8 for line in ax.get_lines()) == 5
     # By default a twentieth of the extent, along both axes.
     extent = np.ptp(np.concatenate([[arc.y["v"], arc.y["x"]] for arc in arcs(stable().solve())], axis=1), axis=1)
-    np.testing.assert_allclose(np.ptp(drawn(ax, "perturbations"), axis=0), extent / 10, rtol=1e-12)
+    np.testing.assert_allclose(np.ptp(drawn(ax, "perturbations (linear)"), axis=0), extent / 10, rtol=1e-12)
 
 
 @pytest.mark.slow

@@ -9,7 +9,9 @@ from branches import branch_of, special_at
 from matplotlib.text import Text
 
 from nsjax import gallery, plot
+from nsjax.continuation import OrbitHalfBranch
 from nsjax.plot._diagram import write_names
+from nsjax.plot._style import legend
 
 
 LABELS = {"omega": "ω [rad/s]", "v_dr": "v [m/s]", "x": "x [m]", "v": "x' [m/s]"}
@@ -59,7 +61,8 @@ def points(line):
 
 
 def lines(ax, label):
-    return [points(line) for line in ax.lines if line.get_label() == label]
+    """All of this kind; those after the first have an underscore before the label, which legends leave out."""
+    return [points(line) for line in ax.lines if line.get_label() in (label, f"_{label}")]
 
 
 def texts(ax):
@@ -187,10 +190,77 @@ def test_circle(forced, belt):
     np.testing.assert_allclose(np.hypot(*circle.T), 1)
     (q,) = (c.q for c in corner.crossings)
     assert q == pytest.approx(1 / 6) and texts(ax) == [f"q = {q:.4g}"]
+    ends = [line.get_label() for line in ax.lines if line.get_marker() == "o"]
+    assert ends == ["q = 0", "q = 1"]  # no half-branches are known, so their sides are not
     with pytest.raises(ValueError, match="but they do not at this flip"):
         plot.multiplier_circle(flip)
     with pytest.raises(ValueError, match="finite"):
         plot.multiplier_circle(belt.special[0])
+
+
+def test_which_side_is_which():
+    """The ends of a path are told apart by the half-branches that have their multipliers, in any order."""
+    halves = [
+        OrbitHalfBranch(-1, 1, np.array([0.0, 0.8], complex), True, ""),
+        OrbitHalfBranch(-1, 1, np.array([0.1, 2.0], complex), False, ""),
+        OrbitHalfBranch(1, 2, np.array([0.8, 0.0], complex), True, ""),  # of another period
+    ]
+    corner = special_at("fold", 1.5, (0.8, 0.0), (2.0, 0.1), halves=halves)
+    ax = plot.multiplier_circle(corner, labels=LABELS)
+    ends = {line.get_label(): np.real(points(line)[:, 0]) for line in ax.lines if line.get_marker() == "o"}
+    assert list(ends) == ["q = 0: stable, ω below", "q = 1: unstable, ω below"]
+    np.testing.assert_allclose([sorted(x) for x in ends.values()], [[0.0, 0.8], [0.1, 2.0]], atol=1e-12)
+
+
+def test_a_legend_of_matplotlib_repeats_nothing(forced):
+    ax = plt.figure().add_subplot()
+    ax.plot([1, 2], [1, 2], label="before")
+    plot.orbit_diagram(forced, ax=ax, legend=False)
+    names = [text.get_text() for text in ax.legend().get_texts()]
+    assert names == ["before", "stable periodic orbit", "unstable periodic orbit"]
+
+
+def test_a_legend_is_no_wider_than_its_axes():
+    """Of panels side by side; else matplotlib leaves no room for the axes."""
+    axes = plt.subplots(1, 3, figsize=(9.0, 3.0), layout="constrained")[1]
+    for ax in axes:
+        for name in ("stable periodic orbit", "unstable periodic orbit", "jump of the multipliers"):
+            ax.plot([0, 1], [0, 1], label=name)
+        legend(ax)
+    axes[0].figure.draw_without_rendering()
+    for ax in axes:
+        assert ax.get_legend().get_window_extent().width < 1.3 * ax.get_window_extent().width
+
+
+@pytest.mark.parametrize("power", [1, 2])
+@pytest.mark.parametrize("turned", [False, True])
+def test_orbits_begin_at_their_hopf_point(power, turned):
+    """x = μ^(1/power) beside the Hopf point at 0: between it and the first orbit the line is as curved as it is to be."""
+    system, size = gallery.ForcedFriction(), np.array([0.0, 0.5, 0.55, 0.65])[:: -1 if turned else 1]
+    hopf = special_at("Hopf", 0.0, (1.0, 0.5))
+    branch = branch_of(system, "omega", size**power, size, [(0.5, 0)] * 4, [hopf], [3 if turned else 0])
+    # The mean of the orbits moves too, but not their least extent.
+    ax = plot.orbit_diagram(branch, lambda b: b.high.x - b.low.x)
+    (line,) = lines(ax, "stable periodic orbit")
+    assert len(line) > 20 and np.all(np.diff(line[:, 0]) * (-1 if turned else 1) > 0)
+    np.testing.assert_allclose(line[:, 0], (line[:, 1] / 1.5) ** power, atol=1e-12)
+
+
+def test_names_cover_no_line():
+    """Two lines that leave a point at a narrow angle, and a long name."""
+    fig, ax = plt.subplots(layout="constrained")
+    ax.set(xlim=(0, 1), ylim=(-1, 1))
+    x = np.linspace(0, 1, 11)
+    for slope in (0.9, -0.9, 0.0):
+        ax.plot(x, slope * x)
+    ax.plot([0.1, 0.1], [-1, 1])
+    write_names(ax, [(0.02, 0.0, "discontinuous\nHopf-pitchfork,\nsupercritical")])
+    fig.canvas.draw()
+    box = Text.get_window_extent(ax.texts[0])
+    for line in ax.lines:
+        ends = line.get_xdata(), line.get_ydata()
+        dense = [np.interp(np.linspace(0, 1, 2000), np.linspace(0, 1, len(e)), e) for e in ends]
+        assert not any(box.contains(*place) for place in ax.transData.transform(np.column_stack(dense)))
 
 
 def test_names_find_room_farther_away():

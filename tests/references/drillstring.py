@@ -1,6 +1,7 @@
 """The drillstring of Appendix A in the complex plane, z = x + iy: for numbers of any kind, those of mpmath too;
 and its periodic orbits by scipy."""
 
+import jax
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import root
@@ -145,3 +146,103 @@ def special_point(y, time, omega, arcs, test):
 
     z = root(residual, np.concatenate([y, [time, omega]]), options=dict(xtol=1e-12, eps=1e-14)).x
     return z[:5], z[5], z[6], np.linalg.eigvals(lap(z[:5], z[5], z[6], arcs)[1])
+
+
+# The branches P1 to P6, from points of branches that were followed.
+
+TESTS = {"fold": of_fold, "flip": of_flip, "Neimark-Sacker": of_neimark_sacker}
+FREE, TOUCH = (-1, 1, 1), (1, 1, 1)
+# P2 from where it touches: slip forwards, backwards, stick, slip forwards. P4 from its lowest speed on.
+OF_P2 = [(FREE, STOP), ((-1, 1, -1), STOP), ((-1, 1, 0), SLIP), (FREE, None)]
+OF_P4 = [(FREE, CONTACT), (TOUCH, RELEASE), (FREE, None)]
+
+
+def arcs_of(branch, i):
+    """The modes of an orbit from its base point on, and what ends each."""
+    arcs = []
+    for segment in branch.segments[i]:
+        wall, roll, bit = segment.mode
+        event = None
+        if segment.ends == "wall":
+            event = CONTACT if wall < 0 else RELEASE
+        elif segment.ends == "bit":
+            event = SLIP if bit == 0 else STOP
+        arcs.append(((wall, 1 if wall < 0 else roll, bit), event))
+    return arcs
+
+
+def flat(tree):
+    return np.array([float(x) for x in jax.tree.leaves(tree)])
+
+
+def at(ys, i):
+    return flat(jax.tree.map(lambda x: x[i], ys))
+
+
+def smooth_point(branch, i, kind):
+    """`special_point` from a point of a branch, for one of its kind."""
+    return special_point(at(branch.ys, i), branch.periods[i], branch.values[i], arcs_of(branch, i), TESTS[kind])
+
+
+def touching(y, period, omega, arcs=((FREE, None),)):
+    """The orbit that touches the stator, without contact: state there (u = 0, r = R_c), period, parameter."""
+
+    def residual(z):
+        start = np.array([1.0, 0.0, *z[:3]])
+        return lap(start, z[3], z[4], arcs)[0] - start
+
+    z = solved(residual, [*y[2:], period, omega])
+    return np.array([1.0, 0.0, *z[:3]]), z[3], z[4]
+
+
+def _slowest(omega):
+    def event(t, y):
+        return field(y, omega, FREE)[4]
+
+    event.terminal, event.direction = True, 1
+    return event
+
+
+def just_stopping(branch, i, special):
+    """The orbit of P4 that just comes to θ' = 0, beside a special point: state there (w = -ω, w' = 0), period,
+    parameter."""
+    j = next(j for j in (i, i + 1) if len(branch.segments[j]) <= 4)
+    y, period = at(branch.ys, j), branch.periods[j]
+    stop = solve_ivp(
+        lambda t, y: field(y, special.value, FREE), (0, 6), lap(y, 2.7, special.value, OF_P4)[0], "DOP853",
+        events=_slowest(special.value), rtol=1e-12, atol=1e-13,
+    )  # fmt: skip
+    guess = stop.y_events[0][0]
+
+    def residual(z):
+        start = np.array([*z[:4], -z[5]])
+        return np.append(lap(start, z[4], z[5], OF_P4)[0] - start, field(start, z[5], FREE)[4])
+
+    z = solved(residual, [*guess[:4], period, special.value])
+    return np.array([*z[:4], -z[5]]), z[4], z[5]
+
+
+def whirl_of_p1(omega):
+    """The largest modulus of the multipliers of a small whirl while the bit slips to and fro, by scipy: the rotor's
+    equation is linear in the complex plane, and its coefficients follow the bit."""
+
+    def equations(t, x, side):
+        phi, w, (z, v) = x[0].real, x[1].real, x[2:].reshape(2, 2)
+        small = 1e-150  # whose square is zero
+        a = [whirl(small * one, small * rate, omega + w, 0.0)[0] / small for one, rate in zip(z, v)]
+        return np.array([w, -phi - side * T_0 / (1 + DELTA * side * (omega + w)), *v, *a], complex)
+
+    def stands(t, x, side):
+        return side * (x[1].real + omega)
+
+    stands.terminal, stands.direction = True, -1
+    phi = -0.25
+    for _ in range(12):  # the orbit attracts
+        x = np.array([phi, -omega, 1, 0, 0, 1], complex)
+        for side in (1, -1):
+            arc = solve_ivp(
+                equations, (0, 30), x, "DOP853", events=stands, args=(side,), first_step=1e-3, rtol=1e-12, atol=1e-14
+            )
+            x = arc.y[:, -1]
+        phi = x[0].real
+    return np.max(np.abs(np.linalg.eigvals(x[2:].reshape(2, 2))))

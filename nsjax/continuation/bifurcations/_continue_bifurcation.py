@@ -1,13 +1,14 @@
 """Curves of special points of periodic orbits in two parameters."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.flatten_util as jfu
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ..._numerics._text import listed, shown
+from ..._numerics._tables import frame
+from ..._numerics._text import components, listed, shown
 from ..._types import Y
 from ...orbits.segments._equations import OrbitCurve
 from ...system._parameter import get_parameter, parameter_path
@@ -91,6 +92,19 @@ class BifurcationCurve(eqx.Module):
     def name(self) -> str:
         """With the surfaces: "grazing of floor"."""
         return self.kind + (f" of {', '.join(self.surfaces)}" if self.surfaces else "")
+
+    def to_dataframe(self) -> Any:
+        """A row for each point: the two parameters by their names, `period`, `t`, the components of the state,
+        `multiplier`, and the name of the point of codimension two there (`special`; empty where there is none).
+
+        **Returns:** a `pandas.DataFrame`: `pip install nsjax[data]`.
+        """
+        special = np.full(len(self), "", dtype=object)
+        for point, i in zip(self.special, self.indices):
+            special[min(max(i, 0), len(self) - 1)] = point.name
+        columns = [*zip(self.parameters, np.asarray(self.values).T), ("period", self.periods), ("t", self.ts)]
+        columns += [*components(self.ys, 1).items(), ("multiplier", self.multipliers), ("special", special)]
+        return frame("BifurcationCurve.to_dataframe", columns)
 
     def __len__(self) -> int:
         return len(self.values)

@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ...._numerics._compile import on_host
 from ...._numerics._progress import ProgressMeter, QUIET
-from ...._numerics._text import shown
+from ...._numerics._tables import frame
+from ...._numerics._text import components, shown
 from ...._types import Y
 from ....flow._integrator import Integrator
 from ....flow._results import is_okay
@@ -29,6 +30,7 @@ from ....sweeps._long_sweep import sweep_in
 from ....sweeps._sweep import sweep
 from ....system._parameter import get_parameter, parameter_path, put_parameter
 from ....system._system import arrays_of, System
+from ..._branch import named_apart
 from ..._checks import check_precision
 from .._start import curve_and_start, order_of, phase_of
 from .._test_functions import BRANCH, complex_pair, PASSED, Test
@@ -72,6 +74,22 @@ class OrbitBranches(eqx.Module):
     start: np.ndarray
     num: np.ndarray
     ends: np.ndarray
+
+    def to_dataframe(self) -> Any:
+        """A row for each point of each lane: `lane`, `point`, the parameter by its name, `period`, `order`, `t`, the
+        components of the state, `low` and `high`, `multiplier`, `stable`, and what the point is (`kind`).
+
+        **Returns:** a `pandas.DataFrame`: `pip install nsjax[data]`.
+        """
+        rows = np.arange(self.values.shape[1]) < np.asarray(self.num)[:, None]
+        lane, point = np.indices(self.values.shape)
+        columns: dict[str, Any] = dict(lane=lane, point=point) | {self.parameter: self.values}
+        columns |= dict(period=self.periods, order=np.broadcast_to(self.orders[:, None], rows.shape), t=self.ts)
+        columns |= named_apart(components(self.ys, 2), self.parameter)
+        for name in ("low", "high"):
+            columns |= {f"{name}.{part}": x for part, x in components(getattr(self, name), 2).items()}
+        columns |= dict(multiplier=self.multipliers, stable=self.stable, kind=self.kinds)
+        return frame("OrbitBranches.to_dataframe", [(name, np.asarray(x)[rows]) for name, x in columns.items()])
 
     def __len__(self) -> int:
         return len(self.values)
