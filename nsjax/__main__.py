@@ -66,7 +66,6 @@ from .orbits._guess import of_relays
 from .system._system import arrays_of
 
 
-SOLUTION, DRAWING = 6, 4  # [s] the first time, about, on one core of today
 FAILURE = 1  # exit status of a numerical failure; `USAGE` is that of a mistake
 DENSE = dfx.SaveAt(dense=True)
 
@@ -77,7 +76,7 @@ def _simulate(args: argparse.Namespace, job: Job, t0: float, search: bool) -> So
     t1 = job.t1 if args.t1 is None else args.t1
     if t1 is None:
         t1 = t0 + (100.0 if job.system.period is None else 20 * float(job.system.period))
-    note(f"following the solution to t = {t1:g}", first=SOLUTION)
+    note(f"following the solution to t = {t1:g}", compiles=True)
     how, mode = controller(args) | BOUNDS, given_mode(args, job)
     if search:
         start, y0, given = checked_start(job.system, t0, start_of(job), mode)
@@ -142,7 +141,7 @@ def _run(args: argparse.Namespace) -> int:
         orbit, trouble = find(args, job, t0, (job.guess.y0, None), (job.y0, given_mode(args, job)))
     elif search and is_okay(sol.result):
         orbit, trouble = find(args, job, t0, (job.y0, given_mode(args, job)))
-    note("drawing", first=DRAWING)
+    note("drawing", compiles=True)
     files = draw(job, sol, orbit, args.out)
     words = [report(job, sol, orbit, trouble)]
     found = [] if diagram is None else follow(args, job, diagram, orbit)

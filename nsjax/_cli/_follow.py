@@ -102,7 +102,7 @@ def _orbits(
         orbit, trouble = find(args, job, t0, (guess_of(args, job), given_mode(args, job)))
     if orbit is None:
         return None, trouble
-    note(f"following {family.name or 'the orbit'}", first=20)
+    note(f"following {family.name or 'the orbit'}", compiles=True)
     how: dict[str, Any] = dict(max_laps=getattr(args, "max_laps", None) or family.laps, progress_meter=meter())
     if family.most is not None:
         how["max_branches"] = family.most

@@ -20,15 +20,16 @@ BOUNDS = dict(max_steps=20_000, max_events=1024)
 Start = tuple[Any, dict[str, int] | None]  # a state, and the modes that were given for it
 
 
-def note(text: str, first: int = 0) -> None:
+def note(text: str, compiles: bool = False) -> None:
     """What is under way, for whoever waits.
 
     **Arguments:**
 
     - `text`: the stage.
-    - `first`: how long it takes where the program is not in the cache yet, about [s].
+    - `compiles`: whether it takes several times as long where its programs are not in the cache yet. How long that is
+        depends on the machine and the model, and is not foretold.
     """
-    STAGES.stage(f"{text} (about {first} s the first time)" if first else text)
+    STAGES.stage(f"{text} (compiles the first time)" if compiles else text)
 
 
 def meter() -> ProgressMeter:

@@ -116,7 +116,7 @@ def _half(
     if np.any(matters & (signs * here < -ACTIVE)):
         return None
     mode_array, direction = mode, np.asarray(tangent)
-    step = step_along(curve, u, direction, np.asarray(length), mode_array)
+    step = step_along(curve, u, direction, length, mode_array)
     if not step.good:
         return None
     if abs(float(step.u[-1] - u[-1])) <= CONTINUUM and length < 1e-2:

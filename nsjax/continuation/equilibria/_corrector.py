@@ -1,13 +1,16 @@
 """Curves of equilibria, N equations for N + 1 unknowns: the compiled parts of a pseudo-arclength continuation."""
 
 import functools as ft
+import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optimistix as optx
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..._numerics._bracket import bracketed
 from ..._numerics._compile import interactive
 from ..._numerics._linalg import bialternate
 from ..._numerics._root import find_root, Newton
@@ -90,67 +93,65 @@ def _corrected(curve: Curve, origin: Array, tangent: Array, s: Array, guess: Arr
 
 
 @ft.partial(interactive, host=True)
-def step_along(curve: Curve, u: Array, tangent: Array, s: Array, mode: Array) -> Step:
-    """One step of length `s` along the curve."""
-    end, good = _corrected(curve, u, tangent, s, u + s * tangent, mode)
+def _step(curve: Curve, u: Array, tangent: Array, s: Array, guess: Array, mode: Array) -> Step:
+    end, good = _corrected(curve, u, tangent, s, guess, mode)
     ahead, scale = _tangent(curve, end, tangent, mode), _scale(curve, u, tangent, mode)
-    here, there = _probe(curve, u, tangent, mode, scale), _probe(curve, end, tangent, mode, scale)
+    # A loop of two turns: written out twice, the test functions were a third of the time that all of it compiles.
+    probes = jax.lax.map(lambda u: _probe(curve, u, tangent, mode, scale), jnp.stack([u, end]))
+    here, there = (jax.tree.map(lambda x, i=i: x[i], probes) for i in range(2))
     good = good & jnp.all(jnp.isfinite(ahead)) & jnp.all(jnp.isfinite(there.values))
     return Step(end, ahead, here, there, curve.record(end, mode), good)
+
+
+def step_along(curve: Curve, u: Array, tangent: Array, s: float, mode: Array) -> Step:
+    """One step of length `s` along the curve."""
+    return _step(curve, u, tangent, np.asarray(s, u.dtype), u + s * tangent, mode)
 
 
 class Place(NamedTuple):
     """A point found on the curve, and the tangent just before it."""
 
-    s: Float[Array, ""]
+    s: float
     u: Float[Array, " n+1"]
     tangent: Float[Array, " n+1"]
-    value: Float[Array, ""]
-    good: Bool[Array, ""]
+    value: float
 
 
-@ft.partial(interactive, host=True)
-def locate(
-    curve: Curve,
-    step: Step,
-    origin: Array,
-    tangent: Array,
-    ends: Array,
-    mode: Array,
-    which: Array,
-    *,
-    slope: Array,
-) -> Place:
-    """Where between the distances `ends` along `tangent` a test function, or its derivative, is zero: by bisection,
-    which needs no derivative of it, on the curve, whose equations are regular there."""
-    length, scale = tangent @ (step.u - origin), _scale(curve, origin, tangent, mode)
+class Chord:
+    """The points of a step, by their distance `s` along the tangent at its beginning: each is computed once.
 
-    def at(s: Array) -> tuple[Array, Array]:
-        return _corrected(curve, origin, tangent, s, origin + s / length * (step.u - origin), mode)
+    They come from the program of the step itself. One of its own for zeros took as long to compile as all the others
+    together.
+    """
 
-    def value(s: Array) -> Array:
-        probe = _probe(curve, at(s)[0], tangent, mode, scale)
-        return jnp.where(slope, probe.slopes[which], probe.values[which])
+    def __init__(self, curve: Curve, step: Step, origin: Array, tangent: Array, mode: Array):
+        self._call = lambda s, guess: _step(curve, origin, tangent, np.asarray(s, origin.dtype), guess, mode)
+        self._origin, self._along = origin, (step.u - origin) / (tangent @ (step.u - origin))
+        self._seen: dict[float, Step] = {}
 
-    sign = jnp.where(value(ends[1]) < 0, -1.0, 1.0).astype(origin.dtype)
-    solver = optx.Bisection(rtol=1e-15, atol=1e-15, flip=False)
-    found = optx.root_find(
-        lambda s, _: sign * value(s),
-        solver,
-        jnp.mean(ends),
-        options=dict(lower=ends[0], upper=ends[1]),
-        max_steps=70,
-        throw=False,
-    )
-    # Where the equations are singular exactly, a place beside it is known.
-    exact = at(found.value)[0]
-    beside = found.value - 1e-7 * (ends[1] - ends[0])
-    s = jnp.where(jnp.all(jnp.isfinite(exact)), found.value, beside)
-    u, good = at(s)
-    probe = _probe(curve, u, tangent, mode, scale)
-    # The tangent with which it is reached: on the surface itself a field may have a kink that no switch tells of.
-    arriving = _tangent(curve, at(s * (1 - 1e-6))[0], tangent, mode)
-    return Place(s, u, arriving, probe.values[which], good)
+    def at(self, s: float) -> Step:
+        if s not in self._seen:
+            self._seen[s] = self._call(s, self._origin + s * self._along)
+        return self._seen[s]
+
+    def zero(self, low: float, high: float, read: Callable[[Probe], Any]) -> Place:
+        """Where what is `read` of the test functions vanishes between two distances. That needs no derivative of it,
+        and the equations of the curve are regular there. If it has one sign at both, it does so at the lower one, to
+        rounding."""
+
+        def value(step: Step) -> float:
+            found = float(read(step.there))
+            return found if math.isfinite(found) else 0.0  # the equations are singular exactly there
+
+        s, ends = low, (self.at(low), self.at(high))
+        if value(ends[0]) * value(ends[1]) <= 0:
+            s = bracketed({s: step for s, step in self._seen.items() if low <= s <= high}, self.at, value)
+        found = self.at(s)
+        if not np.all(np.isfinite(found.u)):  # a place beside it is known
+            s -= 1e-7 * (high - low)
+            found = self.at(s)
+        # The tangent with which it is reached: on the surface itself a field may have a kink that no switch tells of.
+        return Place(s, found.u, self.at(s * (1 - 1e-6)).tangent, float(read(found.there)))
 
 
 @ft.partial(interactive, host=True)

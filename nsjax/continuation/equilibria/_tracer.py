@@ -8,7 +8,7 @@ import numpy as np
 from .._tracer import AbstractTracer, Zero
 from ._bifurcation import unstable_number
 from ._corner import active, EquilibriumPoint, fold_at, hopf_at
-from ._corrector import branch_point, kept, locate, on_surface, step_along
+from ._corrector import branch_point, Chord, kept, on_surface, step_along
 from ._equations import EITHER, EquilibriumCurve, Record
 from ._test_functions import BRANCH, FOLD, GUARDS, HIGH, LOW, MARK, PAIR, PASSED
 
@@ -29,7 +29,7 @@ class EquilibriumTracer(AbstractTracer[EquilibriumPoint]):
     aim = 0.1
 
     def at(self, point: EquilibriumPoint, s: float) -> EquilibriumPoint | None:
-        step = step_along(self.curve, point.u, point.tangent, np.asarray(s), point.mode)
+        step = step_along(self.curve, point.u, point.tangent, s, point.mode)
         return EquilibriumPoint(step.u, step.tangent, point.mode, step.record, step) if step.good else None
 
     def zeros(
@@ -108,11 +108,12 @@ class EquilibriumTracer(AbstractTracer[EquilibriumPoint]):
         falls, rises = np.asarray(step.here.slopes), np.asarray(step.there.slopes)
         found: list[Zero] = []
 
+        chord = Chord(self.curve, step, u, tangent, mode)
+
         def located(ends: tuple[float, float], which: int, slope: bool = False) -> tuple[Zero, float]:
-            number, flag = np.asarray(which), np.asarray(slope)
-            place = locate(self.curve, step, u, tangent, np.asarray(ends), mode, number, slope=flag)
+            place = chord.zero(*ends, lambda probe: probe.slopes[which] if slope else probe.values[which])
             point = EquilibriumPoint(place.u, place.tangent, mode, before.record)
-            return Zero(float(place.s), which, point, marks=which == MARK), float(place.value)
+            return Zero(place.s, which, point, marks=which == MARK), place.value
 
         for i in map(int, np.flatnonzero(signs)):
             sign = signs[i] if signs[i] != EITHER else np.sign(old[i])
