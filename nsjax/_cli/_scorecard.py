@@ -338,9 +338,9 @@ def followed(name: str) -> OrbitBranch:
     begin = Start(entry.system(), entry.orbit.y0, entry.orbit.period)
     if family.start is not None:
         begin = family.start(entry.system())
-    how = dict(rtol=1e-12, atol=1e-12, max_steps=8192, max_events=16)
+    how: dict[str, Any] = dict(rtol=1e-12, atol=1e-12)
     orbit = find_orbit(begin.system, begin.y0, period=begin.period, **how)
-    most = {} if family.most is None else dict(max_branches=family.most)
+    most: dict[str, Any] = {} if family.most is None else dict(max_branches=family.most)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "There are more than `max_branches`")
         return continue_orbit(begin.system, orbit, "omega", family.interval, max_laps=family.laps, **most, **how)
