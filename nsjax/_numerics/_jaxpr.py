@@ -149,7 +149,7 @@ def dependence(fn: Callable[[Any], Any], x: Any) -> np.ndarray:
     """Which results of `fn`, scalars, may depend on which numbers of `x`: booleans `(results, numbers)`."""
     jaxpr = jax.make_jaxpr(fn)(x).jaxpr
     shapes = [v.aval.shape for v in jaxpr.invars]
-    ends = np.cumsum([0, *map(np.prod, shapes)], dtype=int)
+    ends = np.cumsum([0, *[v.aval.size for v in jaxpr.invars]])
     bits = np.array([1 << i for i in range(ends[-1])], object)  # integers of Python: of any number of bits
     masks = [bits[start:end].reshape(shape) for start, end, shape in zip(ends, ends[1:], shapes)]
     found = [int(_union(m)) for m in _masks(jaxpr, masks)[0]]

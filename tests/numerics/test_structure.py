@@ -63,7 +63,12 @@ def test_dependence_on_many_numbers_at_once():
 
     def fn(x):
         bent = jnp.sin(x["a"])
-        moved = [bent[0] * bent[69], jnp.sum(x["b"][:, 1]), jnp.where(x["a"][69] > 0, x["b"][1, 2], 2.0), jnp.asarray(1.0)]
+        moved = [
+            bent[0] * bent[69],
+            jnp.sum(x["b"][:, 1]),
+            jnp.where(x["a"][69] > 0, x["b"][1, 2], 2.0),
+            jnp.asarray(1.0),
+        ]
         return [*moved, jnp.pad(x["a"], (2, 0))[3], (x["b"] @ M)[1, 0], jnp.sum(x["a"][::2]), jnp.linalg.norm(x["a"])]
 
     wanted = np.zeros((8, 76), bool)
