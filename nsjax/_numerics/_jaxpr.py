@@ -102,10 +102,10 @@ def _passed_on(e: Any, have: list[Mask]) -> list[Mask]:
         return [_either(*np.broadcast_arrays(*have))]
     if name in MOVING:
         moved = MOVING[name](e.params, *have)
-        return moved if isinstance(moved, list) else [moved]
+        return [np.asarray(m, np.result_type(*have)) for m in (moved if isinstance(moved, list) else [moved])]
     if name == "dot_general" and not e.params["dimension_numbers"][1][0]:
         left, right = (_union(m, tuple(axes)) for m, axes in zip(have, e.params["dimension_numbers"][0]))
-        return [np.bitwise_or.outer(left, right)]
+        return [np.asarray(np.bitwise_or.outer(left, right), np.result_type(left, right))]
     marks = _either(*map(_union, have))
     return [np.broadcast_to(marks, getattr(v.aval, "shape", ())) for v in e.outvars]
 
