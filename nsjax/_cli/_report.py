@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._numerics._compile import interactive
+from .._numerics._units import Note, notes, ratio, time_unit
 from .._types import Y
 from .._version import __version__
 from ..derivatives._saltation import saltation_matrices
@@ -22,7 +23,6 @@ from ..system._mode import change_words
 from ..system._system import System
 from ._job import Job
 from ._mistakes import advice
-from ._units import Note, notes, ratio
 
 
 SHOWN = 24  # events of a simulation that are printed
@@ -47,7 +47,7 @@ class Units(NamedTuple):
             name: of_scene.get(name, fields.get(name.partition("[")[0], Note()).unit) for name in components(job.y0)
         }
         used = [*state.values(), *(note.unit for note in parameters.values())]
-        time = "s" if any("s" in unit.replace("/", " ").split() for unit in used) else ""
+        time = time_unit(used)
         if job.from_gallery:
             state = {name: unit or "-" for name, unit in state.items()}
             time = time or "-"

@@ -7,7 +7,7 @@ import numpy as np
 from .._numerics._text import components
 from ..maps._basins import Basins
 from ._path import chosen
-from ._style import axes_or_new, axis_label, Labels, legend as add_legend
+from ._style import axes_or_new, axis_label, declared, Labels, legend as add_legend
 
 
 if TYPE_CHECKING:
@@ -75,6 +75,7 @@ def basins(
             box = dict(marker="s", linestyle="none", markersize=8, markeredgecolor="0.5")
             ax.plot([], [], markerfacecolor=colours[value + 2], label=word, **box)
     ax.set(xlim=(across.min(), across.max()), ylim=(up.min(), up.max()))
+    labels = declared(labels, found.starts)
     ax.set(xlabel=axis_label(labels, x), ylabel=axis_label(labels, y))
     if legend:
         add_legend(ax)

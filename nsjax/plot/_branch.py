@@ -12,7 +12,7 @@ from ..continuation.equilibria._branch import Branch
 from ..orbits._orbit import Orbit
 from ..system._parameter import get_parameter, parameter_path
 from ._diagram import begun, LINE, mark, stretches, UNSTABLE, wording, write_names
-from ._style import axes_or_new, axis_label, Labels, legend as add_legend
+from ._style import axes_or_new, axis_label, declared, Labels, legend as add_legend
 
 
 if TYPE_CHECKING:
@@ -47,7 +47,8 @@ def bifurcation_diagram(
     - `names`: whether to write what the special points are; or a function of a `Bifurcation` that gives the words, none
         if empty.
     - `ax`: where to draw; by default a new figure.
-    - `labels`: for the axes, as `{"mu": "μ [-]", "x": "x [m]"}`, a function of the state being "measure".
+    - `labels`: for the axes, as `{"mu": "μ [-]", "x": "x [m]"}`, a function of the state being
+        "measure"; by default the names with the units that model and state declare.
     - `legend`: whether to explain the lines.
     - `style`: for the lines, as in `Axes.plot`.
 
@@ -64,6 +65,7 @@ def bifurcation_diagram(
     points = {id(special): special for one in branch.branches for special in one.special}
     places = [_point(ax, special, measure, names) for special in points.values()]
     name = measure if isinstance(measure, str) else "measure"
+    labels = declared(labels, branch.system, branch.ys)
     ax.set_xlabel(axis_label(labels, branch.parameter))
     ax.set_ylabel(axis_label(labels, name))
     if legend:

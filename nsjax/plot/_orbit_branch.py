@@ -15,7 +15,7 @@ from ..setvalued._eigenvalue_crossings import eigenvalue_path as path_between
 from ._diagram import begun, LINE, mark, stretches, UNSTABLE, wording, write_names
 from ._eigenvalues import eigenvalue_path
 from ._path import chosen
-from ._style import axes_or_new, axis_label, Labels, legend as add_legend, once
+from ._style import axes_or_new, axis_label, declared, Labels, legend as add_legend, once
 
 
 if TYPE_CHECKING:
@@ -66,7 +66,8 @@ def orbit_diagram(
     - `names`: whether to write what the special points are; or a function of an `OrbitBifurcation` that gives the
         words, none if empty.
     - `ax`: where to draw; by default a new figure.
-    - `labels`: for the axes, as `{"omega": "ω [rad/s]", "x": "x [m]"}`, a function being "measure".
+    - `labels`: for the axes, as `{"omega": "ω [rad/s]", "x": "x [m]"}`, a function being "measure"; by
+        default the names with the units that model and state declare.
     - `legend`: whether to explain the lines.
 
     **Returns:** the axes.
@@ -82,6 +83,7 @@ def orbit_diagram(
         height = float(heights[k][i])
         mark(ax, special.value, height, special.discontinuous, special.is_bifurcation)
         words.append((special.value, height, _words(names, special)))
+    labels = declared(labels, branch.system, branch.ys)
     ax.set_xlabel(axis_label(labels, branch.parameter))
     ax.set_ylabel(_measure_label(measure, branch, labels))
     if legend:
@@ -159,6 +161,7 @@ def multiplier_diagram(
         clip = dict(clip_on=not np.isinf(ends).any())
         ax.plot(np.full(len(places), found.value), places, color=color, **HALF, **clip)
         words.append((found.value, float(np.max(places)), _words(names, found)))
+    labels = declared(labels, branch.system, branch.ys)
     ax.set_xlabel(axis_label(labels, branch.parameter))
     ax.set_ylabel(axis_label(labels, "multiplier", default))
     if legend:

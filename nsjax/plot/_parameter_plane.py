@@ -7,7 +7,7 @@ import numpy as np
 
 from ..continuation.bifurcations._continue_bifurcation import BifurcationCurve, CodimensionTwo
 from ._diagram import write_names
-from ._style import axes_or_new, axis_label, Labels, legend as add_legend
+from ._style import axes_or_new, axis_label, declared, Labels, legend as add_legend
 
 
 if TYPE_CHECKING:
@@ -38,7 +38,8 @@ def parameter_plane(
     - `names`: whether to write what the points of codimension two are; or a function of a `CodimensionTwo` that gives
         the words, none if empty.
     - `ax`: where to draw; by default a new figure.
-    - `labels`: for the axes, as `{"omega": "ω [rad/s]"}`.
+    - `labels`: for the axes, as `{"omega": "ω [rad/s]"}`; by default the names with the units that the
+        model declares.
     - `legend`: whether to explain the lines.
 
     **Returns:** the axes.
@@ -67,6 +68,7 @@ def parameter_plane(
             text = names(point) if callable(names) else point.name if names else ""
             words.append((float(at[0]), float(at[1]), text))
     ax.margins(0.08, 0.1)
+    labels = declared(labels, curves[0].system)
     ax.set_xlabel(axis_label(labels, first))
     ax.set_ylabel(axis_label(labels, second))
     if legend:

@@ -18,7 +18,7 @@ from ..system._relay import relay
 from ..system._sgn import sgn
 from ..system._switch import AbstractSwitch
 from ._path import arcs, chosen, solved
-from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_legend, mode_line, once
+from ._style import axes_or_new, axis_label, declared, EVENT, JUMP, Labels, legend as add_legend, mode_line, once
 
 
 if TYPE_CHECKING:
@@ -51,7 +51,8 @@ def phase_portrait(
     - `sol`: a `Solution` with `SaveAt(dense=True)` (or saved states), or an `Orbit`.
     - `x`, `y`: names of components of the state; by default the first two.
     - `ax`: where to draw; by default a new figure.
-    - `labels`: for the axes, as `{"x": "x [m]"}`; by default the names of the components.
+    - `labels`: for the axes, as `{"x": "x [m]"}`; by default the names of the components, with the units that
+        their class declares, in comments or metadata.
     - `surfaces`, `events`: whether to draw them.
     - `legend`: whether to explain the colours.
     - `style`: properties of the line, as in `Axes.plot`, in place of those of the mode.
@@ -72,6 +73,7 @@ def phase_portrait(
         ax.plot(arc.y[x], arc.y[y], solid_capstyle="butt", **own | dict(label=once(ax, own["label"])))
     if events:
         _draw_events(ax, sol, x, y)
+    labels = declared(labels, sol.system, sol.y1)
     ax.set_xlabel(axis_label(labels, x))
     ax.set_ylabel(axis_label(labels, y))
     if surfaces and len(components(sol.y1)) == 2:
@@ -192,6 +194,7 @@ def poincare_section(
     ax = axes_or_new(ax)
     style = dict(marker=".", markersize=2, linestyle="none") | style
     ax.plot(values[x], values[y], **style)
+    labels = declared(labels, points)
     ax.set_xlabel(axis_label(labels, x))
     ax.set_ylabel(axis_label(labels, y))
     return ax

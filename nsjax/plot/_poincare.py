@@ -9,7 +9,7 @@ import numpy as np
 from .._numerics._text import components
 from ..maps._brute_force import BruteForce
 from ._path import chosen
-from ._style import axes_or_new, axis_label, JUMP, Labels, legend as add_legend
+from ._style import axes_or_new, axis_label, declared, JUMP, Labels, legend as add_legend
 
 
 if TYPE_CHECKING:
@@ -130,7 +130,8 @@ def brute_force(
     - `measure`: the scalar that stands for the state: the name of a component, or a function of the state; by default
         the first component. Branches are drawn by their values at the same section if they shall meet the dots.
     - `ax`: where to draw; by default a new figure.
-    - `labels`: for the axes, as `{"omega": "ω [rad/s]", "x": "x [m]"}`, a function of the state being "measure".
+    - `labels`: for the axes, as `{"omega": "ω [rad/s]", "x": "x [m]"}`, a function of the state being
+        "measure"; by default the names with the units that model and state declare.
     - `style`: for the dots, as in `Axes.plot`.
 
     **Returns:** the axes.
@@ -146,6 +147,7 @@ def brute_force(
         points = by_name[name]
     values = np.broadcast_to(np.asarray(found.values)[:, None, None], points.shape)
     ax.plot(values.ravel(), points.ravel(), **DOTS | style)
+    labels = declared(labels, found.system, found.ys)
     ax.set_xlabel(axis_label(labels, found.parameter))
     ax.set_ylabel(axis_label(labels, name))
     return ax

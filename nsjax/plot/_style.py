@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, TYPE_CHECKING
 
+from .._numerics._units import notes, time_unit
 from ..system._system import System
 
 
@@ -34,6 +35,14 @@ def mode_line(system: System, mode: tuple[int, ...]) -> dict[str, Any]:
         if switch.modes:  # each tick of a clock is another mode: no line for each
             number += 3**k * switch.modes.index(value)
     return dict(color=f"C{number % 10}", linewidth=3.5 if slides else 1.5, label="; ".join(filter(None, words)) or None)
+
+
+def declared(labels: Labels, *owners: Any) -> dict[Any, str]:
+    """Labels, and where there is none the name with the unit that the class of a model or a state declares."""
+    units = {name: note.unit for owner in owners for name, note in notes(type(owner)).items() if note.unit}
+    if time := time_unit(units.values()):
+        units["t"] = time
+    return {name: f"{name} [{unit}]" for name, unit in units.items()} | dict(labels or {})
 
 
 def axis_label(labels: Labels, name: Any, default: str | None = None) -> str:

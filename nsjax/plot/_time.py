@@ -7,7 +7,7 @@ import numpy as np
 
 from .._numerics._text import components
 from ._path import arcs, chosen, solved
-from ._style import axes_or_new, axis_label, EVENT, JUMP, Labels, legend as add_legend, mode_line, once
+from ._style import axes_or_new, axis_label, declared, EVENT, JUMP, Labels, legend as add_legend, mode_line, once
 
 
 if TYPE_CHECKING:
@@ -29,7 +29,8 @@ def time_series(
     - `sol`: a `Solution` with `SaveAt(dense=True)` (or saved states), or an `Orbit`.
     - `component`: its name; by default the first.
     - `ax`: where to draw; by default a new figure.
-    - `labels`: for the axes, as `{"t": "t [s]", "x": "x [m]"}`; by default the names.
+    - `labels`: for the axes, as `{"t": "t [s]", "x": "x [m]"}`; by default the names, with the units that the
+        classes of model and state declare: `x: Array  # [m]`, or `x: Array = eqx.field(metadata=dict(unit="m"))`.
     - `legend`: whether to explain the colours.
 
     **Returns:** the axes.
@@ -50,6 +51,7 @@ def time_series(
         if low != high:
             ax.plot([t, t], [low, high], **JUMP)
     ax.plot(times, after, label=once(ax, "event" if n else None), **EVENT)
+    labels = declared(labels, sol.system, sol.y1)
     ax.set_xlabel(axis_label(labels, "t"))
     ax.set_ylabel(axis_label(labels, name))
     if legend:

@@ -16,7 +16,7 @@ import nsjax
 from nsjax import __main__ as command, gallery
 from nsjax._cli import _follow, _scorecard, _search
 from nsjax._cli._mistakes import advice
-from nsjax._cli._units import notes, ratio
+from nsjax._numerics._units import notes, ratio
 
 
 PERIOD = 10 + np.pi + 2 * np.arctan(1 / 5)  # of the stick-slip orbit

@@ -6,6 +6,7 @@ import types
 from typing import NamedTuple
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib
@@ -17,6 +18,7 @@ from jax import Array
 import nsjax
 from nsjax import gallery, plot
 from nsjax.plot._path import arcs
+from nsjax.plot._style import declared
 
 
 DENSE = dfx.SaveAt(dense=True, t1=True)
@@ -121,7 +123,7 @@ def test_phase_portrait_draws_where_it_is_told():
     given = plot.phase_portrait(
         stick_slip(), "v", "x", ax=ax, surfaces=False, events=False, legend=False, color="0.7", linewidth=0.5
     )
-    assert given is ax and (ax.get_xlabel(), ax.get_ylabel()) == ("v", "x")
+    assert given is ax and (ax.get_xlabel(), ax.get_ylabel()) == ("v [m/s]", "x [m]")
     assert len(ax.get_lines()) == 4 and {line.get_color() for line in ax.get_lines()} == {"0.7"}
     assert ax.get_legend() is None and not ax.collections
 
@@ -150,7 +152,7 @@ def test_time_series():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("t [s]", "v [m/s]")
     events = next(line for line in ax.get_lines() if line.get_label() == "event")
     np.testing.assert_allclose(events.get_xdata(), ball().events.t[:3])
-    assert plot.time_series(stick_slip()).get_ylabel() == "x"
+    assert plot.time_series(stick_slip()).get_ylabel() == "x [m]"
 
 
 def test_fundamental_matrix_is_cut_at_events():
@@ -183,7 +185,7 @@ def test_poincare_section():
     ax = plot.poincare_section(gallery.Motion(np.arange(5.0), np.arange(5.0) ** 2), "v", "x", labels={"v": "v [m/s]"})
     (dots,) = ax.get_lines()
     assert dots.get_xdata().tolist() == [0, 1, 4, 9, 16] and dots.get_linestyle() == "None"
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("v [m/s]", "x")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("v [m/s]", "x [m]")
 
 
 # Mistakes.
@@ -408,3 +410,27 @@ def test_attractor_chart():
     assert low == -high < 0 and mesh.get_array().mask.sum() == 1 and ax.figure.axes[1].get_ylabel() == "λ₁ [1/s]"
     with pytest.raises(ValueError, match="`by` must be"):
         plot.attractor_chart(found, "phase")
+
+
+class Measured(nsjax.System):
+    """Units in a comment, and in metadata; of one parameter none."""
+
+    omega: float = 2.0  # frequency [rad/s]
+    damping: float = eqx.field(default=0.1, metadata=dict(unit="1/s"))
+    power: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return gallery.Motion(y.v, -(self.omega**2) * y.x - self.damping * y.v)
+
+
+def test_axes_have_the_units_that_classes_declare():
+    """Where no label is given; of what declares none the name stands alone."""
+    sol = nsjax.solve(Measured(), 0.0, 1.0, gallery.Motion(1.0, 0.0), saveat=dfx.SaveAt(dense=True))
+    ax = plot.time_series(sol, "v", legend=False)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("t [s]", "v [m/s]")
+    ax = plot.phase_portrait(sol, labels={"v": "velocity"}, legend=False)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "velocity")
+    branch = nsjax.continue_equilibrium(Measured(), gallery.Motion(0.0, 0.0), "power", (0.5, 1.5))
+    ax = plot.bifurcation_diagram(branch, legend=False)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("power", "x [m]")
+    assert declared(None, Measured()) == {"omega": "omega [rad/s]", "damping": "damping [1/s]", "t": "t [s]"}

@@ -2,9 +2,11 @@
 `x: Array  # displacement [m]`."""
 
 import dataclasses
+import functools as ft
 import inspect
 import re
 from collections import Counter
+from collections.abc import Iterable
 from typing import NamedTuple
 
 
@@ -17,6 +19,7 @@ class Note(NamedTuple):
     unit: str = ""
 
 
+@ft.lru_cache
 def notes(cls: type) -> dict[str, Note]:
     """What is said of the fields of a class: by the metadata `unit` and `meaning` of a field, or by the comments of the
     class and its bases, which are not there where there is no source."""
@@ -32,6 +35,11 @@ def notes(cls: type) -> dict[str, Note]:
         if told:
             found[field.name] = found.get(field.name, Note())._replace(**told)
     return found
+
+
+def time_unit(units: Iterable[str]) -> str:
+    """Seconds if any of them has these; else nothing is known of it."""
+    return "s" if any("s" in unit.replace("/", " ").split() for unit in units) else ""
 
 
 def ratio(unit: str, other: str) -> str:
