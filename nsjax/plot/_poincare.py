@@ -147,7 +147,7 @@ def brute_force(
         points = by_name[name]
     values = np.broadcast_to(np.asarray(found.values)[:, None, None], points.shape)
     ax.plot(values.ravel(), points.ravel(), **DOTS | style)
-    labels = declared(labels, found.system, found.ys)
+    labels = declared(labels, found.ys)
     ax.set_xlabel(axis_label(labels, found.parameter))
     ax.set_ylabel(axis_label(labels, name))
     return ax
