@@ -38,24 +38,16 @@ __all__ = ["AGREES", "DRAWN", "EQUILIBRIA", "ORBITS"]
 # Figures.
 
 
-class Run(NamedTuple):
-    """A picture that `python -m nsjax run KEY` writes."""
+class Command(NamedTuple):
+    """A picture that `python -m nsjax` writes by this command."""
 
+    verb: str  # "run" or "continue"
     key: str
     picture: str
 
     def __str__(self) -> str:
-        return f"`run {_quoted(self.key)}`: {self.picture}"
-
-
-class Continue(NamedTuple):
-    """A picture that `python -m nsjax continue KEY` writes."""
-
-    key: str
-    picture: str
-
-    def __str__(self) -> str:
-        return f"`continue {self.key}`: {self.picture}"
+        key = f'"{self.key}"' if " " in self.key else self.key
+        return f"`{self.verb} {key}`: {self.picture}"
 
 
 class Notebook(NamedTuple):
@@ -79,17 +71,13 @@ class Picture(NamedTuple):
         return f"[{self.file}](pictures/{self.file})"
 
 
-def _quoted(key: str) -> str:
-    return f'"{key}"' if " " in key else key
-
-
 class Figure(NamedTuple):
     """A figure of the thesis, and where it is drawn. `schematic` says what it is if it shows no result; then what is
     named besides corresponds to it, if anything does."""
 
     number: str
     caption: str
-    drawn: tuple[Run | Continue | Notebook | Picture, ...] = ()
+    drawn: tuple[Command | Notebook | Picture, ...] = ()
     schematic: str = ""
 
     @property
@@ -100,16 +88,13 @@ class Figure(NamedTuple):
         return f"{self.schematic}; ours: {places}" if places else self.schematic
 
 
-def in_notebook(stem: str) -> "functools.partial[Notebook]":
-    return functools.partial(Notebook, stem)
-
-
 CHAPTER_2 = functools.partial(Picture, "thesis_2.png")
 CHAPTERS_3_TO_6 = functools.partial(Picture, "thesis_3_to_6.png")
 SKETCHES = functools.partial(Picture, "thesis_sketches.png")
-STICK_SLIP, EQUILIBRIA_03, BRANCHES_04, DRILLSTRING = map(
-    in_notebook, ("01_stick_slip", "03_equilibria", "04_branches", "05_drillstring")
+STICK_SLIP, EQUILIBRIA_03, BRANCHES_04, DRILLSTRING = (
+    functools.partial(Notebook, stem) for stem in ("01_stick_slip", "03_equilibria", "04_branches", "05_drillstring")
 )
+Run, Continue = (functools.partial(Command, verb) for verb in ("run", "continue"))
 DIAGRAM, MULTIPLIERS, CIRCLES = "bifurcation-diagram", "multiplier-diagram", "multiplier-circles"
 SKETCH, DEFINITION, MEASURED = "a sketch of a mechanism", "a sketch of a definition", "a measurement, of no model"
 FIGURES = (

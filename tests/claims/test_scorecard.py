@@ -58,14 +58,20 @@ def period_of_5_7():
     return float(hopf_pitchfork_orbit().period)
 
 
+def rolls(omega, r, b_1=drillstring.B_1):
+    """The radial balance (A.31), while the rotor rolls along the wall."""
+    d = drillstring
+    spin, normal = -d.R * omega / r, d.K_B * (r - d.R_C)
+    return (d.K - omega**2 * d.M_F / 4 + d.M_F * omega * spin + b_1 * r**2 - d.M_A * spin**2) * r + normal
+
+
 def where_rolling_ends():
     """(A.31), (A.32) with friction at its bound, point d."""
     d = drillstring
 
     def balance(omega, r):
         spin, normal = -d.R * omega / r, d.K_B * (r - d.R_C)
-        held = (d.K - omega**2 * d.M_F / 4 + d.M_F * omega * spin + d.B_1 * r**2 - d.M_A * spin**2) * r + normal
-        return [held, (d.C + d.D) * spin * r - d.D * omega / 2 * r + d.MU * normal]
+        return [rolls(omega, r), (d.C + d.D) * spin * r - d.D * omega / 2 * r + d.MU * normal]
 
     with mp.workdps(30):
         return float(mp.findroot(balance, (0.4, 1.01))[0])
@@ -88,6 +94,19 @@ def hopf_of_e2():
 
     with mp.workdps(30):
         return float(mp.findroot(leading, (2.54, 2.5405), solver="secant"))
+
+
+def farthest():
+    """Of section 6.7, c = 0.1 N s/m, v_dr = 0.5 m/s: how far the mass goes after the belt has let it go."""
+    with mp.workdps(30):
+        d, v = mp.mpf("0.05"), mp.mpf("0.5")
+        w, a = mp.sqrt(1 - d**2), 1 - 2 * d * v  # it is let go where x + c v = F_stick = 2
+        b = (v + d * a) / w
+
+        def x(t):
+            return 1 + mp.exp(-d * t) * (a * mp.cos(w * t) + b * mp.sin(w * t))
+
+        return float(x(mp.findroot(lambda t: mp.diff(x, t), 0.5)))
 
 
 def where_slip_backwards_appears():
@@ -229,6 +248,12 @@ def test_numbers_that_are_known_otherwise():
     np.testing.assert_allclose(known["period of the orbit [s]"], period_of_5_7(), rtol=1e-13)
     np.testing.assert_allclose(known["μ of the pitchfork, smoothed with ε = 10"], slope(), rtol=1e-13)
     np.testing.assert_allclose(known["μ of the Hopf point, smoothed with ε = 10"], -slope(), rtol=1e-13)
+    with mp.workdps(30):
+        without = mp.findroot(lambda r: rolls(2, r, 0), 1.57)
+        with_fluid = mp.findroot(lambda r: rolls(3, r), 2.08)
+    np.testing.assert_allclose(known["r while it rolls, ω = 2 rad/s, B₁ = 0 [m]"], float(without), rtol=1e-13)
+    np.testing.assert_allclose(known["r on e4 at ω = 3 rad/s [m]"], float(with_fluid), rtol=1e-13)
+    np.testing.assert_allclose(known["fixed point 3 of the map, v_dr = 0.5 m/s [m]"], farthest(), rtol=1e-13)
 
 
 # Quick ones: no search for an orbit.
@@ -305,13 +330,13 @@ def test_every_figure_of_the_thesis_is_listed():
 @pytest.mark.parametrize("figure", CARD.FIGURES, ids=lambda figure: figure.number)
 def test_what_draws_a_figure_exists(figure):
     for place in figure.drawn:
-        if isinstance(place, CARD.Run):
+        if isinstance(place, CARD.Command) and place.verb == "run":
             entry = gallery.THESIS[place.key]
             several = len(components(entry.y0)) > 1
             written = {"time-series"} | ({"phase-portrait"} if several else set())
             written |= {"fundamental-matrix", "multipliers"} if entry.orbit else set()
             assert place.picture in written
-        elif isinstance(place, CARD.Continue):
+        elif isinstance(place, CARD.Command):
             diagram = DIAGRAMS[place.key]
             written = {picture.kind for picture in diagram.pictures}
             if not all(family.equilibria for family in diagram.families):
