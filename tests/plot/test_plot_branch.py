@@ -10,6 +10,7 @@ from matplotlib.text import Text
 
 from nsjax import gallery, plot
 from nsjax.continuation import OrbitHalfBranch
+from nsjax.maps._brute_force import BruteForce
 from nsjax.plot._diagram import write_names
 from nsjax.plot._style import legend
 
@@ -275,3 +276,16 @@ def test_names_find_room_farther_away():
     assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
     leaders = {text.get_text() for text in ax.texts if text.arrow_patch is not None}
     assert leaders and "alone" not in leaders
+
+
+def test_axes_of_diagrams_have_the_units_that_are_declared(forced, belt):
+    ax = plot.orbit_diagram(forced)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("omega [rad/s]", "max |x| [m]")
+    assert plot.multiplier_diagram(belt).get_xlabel() == "v_dr [m/s]"
+    assert plot.orbit_diagram(belt, labels=LABELS).get_xlabel() == "v [m/s]"
+    shape = (2, 1, 3)
+    dots = BruteForce(
+        "omega", np.array([1.0, 2.0]), np.zeros(shape), gallery.Motion(np.zeros(shape), np.ones(shape)), None
+    )
+    ax = plot.brute_force(dots, "v")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("omega", "v [m/s]")
