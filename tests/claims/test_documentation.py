@@ -55,7 +55,10 @@ def test_the_surfaces_of_a_relay_are_levels():
 
 def test_what_cannot_be_vmapped_is_named():
     text = " ".join(README.split())
-    assert "set-valued eigenvalues and searches that try one thing after another run in Python; all else can be vmapped" in text
+    assert (
+        "set-valued eigenvalues and searches that try one thing after another run in Python; all else can be vmapped"
+        in text
+    )
     with pytest.raises(ValueError, match="`order` must be given under `jit` and `vmap`"):
         jax.vmap(lambda x: nsjax.find_orbit(nsjax.gallery.thesis("6.8"), Motion(x, 0.0), order=None).period)(
             jnp.ones(2)
