@@ -20,6 +20,7 @@ from . import (
     sweeps as sweeps,
     system as system,
 )
+from ._numerics._programs import keep_programs as keep_programs
 from ._version import __version__ as __version__
 from ._work_precision import (
     Method as Method,

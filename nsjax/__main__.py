@@ -33,7 +33,7 @@ from ._cli import (
     is_off,
     is_ours,
     Job,
-    keep_programs,
+    keep_compiled,
     load,
     mistake,
     model_file,
@@ -228,7 +228,7 @@ def main(argv: list[str] | None = None) -> int:
             STAGES.start("starting")
         args = parse(words)
         if argv is None:  # the process is ours
-            keep_programs(not getattr(args, "no_cache", False))
+            keep_compiled(not getattr(args, "no_cache", False))
             collect_rarely()
         return _run_command(args)
     except UsageError as error:

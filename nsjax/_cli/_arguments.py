@@ -5,8 +5,8 @@ import pathlib
 import tempfile
 from typing import NoReturn
 
+from .._numerics._programs import cache_folder
 from .._version import __version__
-from ._cache import cache_folder
 from ._diagrams import DIAGRAMS
 from ._job import unknown, UsageError
 from ._scorecard import EQUILIBRIA, FAMILIES, NUMBERS_OF, ORBITS
@@ -53,7 +53,7 @@ _count.__name__ = "positive integer"  # argparse says "invalid positive integer 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="nsjax", description="Piecewise-smooth dynamics: the systems of Leine (2000), and your own.")
     parser.epilog = (
-        f"Compiled programs are kept in {cache_folder()}, so that a second call starts sooner; the environment "
+        f"Programs are kept in {cache_folder()}, so that a second call starts sooner; the environment "
         "variable JAX_COMPILATION_CACHE_DIR names another folder, and --no-cache neither reads nor writes one. The "
         "folder may be removed at any time. What a command is doing goes to standard error, unless it is --quiet."
     )

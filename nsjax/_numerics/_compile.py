@@ -10,6 +10,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from ._programs import is_kept, Programs
+
 
 try:
     from jax._src.core import EvalTrace, trace_ctx
@@ -94,11 +96,14 @@ def interactive(fn: F, often: bool = False, host: bool = False) -> F:
     def alone() -> Any:
         return jit(fn, compiler_options=_options(often))
 
+    kept = Programs(fn, lambda: _options(often))
+
     @ft.wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
+        # The options can only be given to the outermost program.
+        run = kept if eager() and is_kept() else alone() if outermost() else within
         with without_collection():
-            # The options can only be given to the outermost program.
-            found = (alone() if outermost() else within)(*args, **kwargs)
+            found = run(*args, **kwargs)
         return on_host(found) if host else found
 
     return cast(F, call)

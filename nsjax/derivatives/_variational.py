@@ -172,8 +172,7 @@ def _by_arcs(
     def matrix(columns: Y) -> Array:
         return jax.vmap(lambda column: jfu.ravel_pytree(column)[0], out_axes=1)(columns)
 
-    def arc(phi: Array, row: tuple) -> tuple[Array, Array]:
-        a, b, y, mode, jump = row
+    def arc(phi: Array, a: Scalar, b: Scalar, y: Y, mode: Array, jump: Array) -> tuple[Array, Array]:
         smooth = VariedModeFlow(model, model.state_at(a, y, tuple(mode)))
         # On an arc that runs backwards so do the times.
         low, high = jnp.minimum(a, b), jnp.maximum(a, b)
@@ -184,8 +183,14 @@ def _by_arcs(
         along = jax.vmap(matrix)(out.ys[1])
         return matrix(out.y1[1]), jnp.zeros_like(along).at[order].set(along)
 
-    whole, by_arc = lax.scan(arc, eye, (begin, end, state, modes, jumps))
+    none = jnp.zeros((len(times), n, n), flat.dtype)
+
+    def turn(phi: Array, row: tuple) -> tuple[Array, Array]:
+        return lax.cond(row[0], arc, lambda phi, *_: (phi, none), phi, *row[1:])
+
+    there = jnp.arange(len(end), dtype=sol.events.num.dtype) <= sol.events.num
+    whole, by_arc = lax.scan(turn, eye, (there, begin, end, state, modes, jumps))
     # Each time belongs to the arc that ends at or after it; the first one wins, so that Φ is that before a jump.
     sign = jnp.where(sol.t1 >= t0, 1, -1)
-    index = jnp.clip(jnp.searchsorted(sign * end, sign * times, side="left"), 0, len(end) - 1)
+    index = jnp.clip(jnp.searchsorted(sign * end, sign * times, side="left"), 0, sol.events.num)
     return whole, by_arc[index, jnp.arange(len(times))]
