@@ -256,15 +256,12 @@ def first_roots(
         return jax.vmap(first_root)(a)
     busy = ~no_root(a) & wanted()
     rank = jnp.cumsum(busy.astype(jnp.int32))
-    nothing = jnp.full(count + FEW, count, jnp.int32)
-    order = nothing.at[jnp.where(busy, rank - 1, count + FEW)].set(jnp.arange(count, dtype=jnp.int32), mode="drop")
-    table = jnp.stack(a, axis=-1)
 
     def look(carry: tuple) -> tuple:
         begin, found, root = carry
-        place = jax.lax.dynamic_slice(order, (begin,), (FEW,))
-        some = table.at[place].get(mode="clip")
-        new = jax.vmap(first_root)([some[..., j] for j in range(len(a))])
+        wanted = begin + 1 + jnp.arange(FEW, dtype=jnp.int32)
+        place = jnp.searchsorted(rank, wanted, method="compare_all")  # past the last one: dropped
+        new = jax.vmap(first_root)([x.at[place].get(mode="clip") for x in a])
         found, root = (x.at[place].set(y, mode="drop") for x, y in zip((found, root), new))
         return begin + FEW, found, root
 
