@@ -85,6 +85,18 @@ def on_host(tree: Any) -> Any:
     return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree)
 
 
+def long_running(fn: F) -> F:
+    """`equinox.filter_jit` for what is called directly and runs for long: with all of XLA's optimisation."""
+    within: Any = eqx.filter_jit(fn)
+    kept = Programs(fn, dict)
+
+    @ft.wraps(fn)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        return (kept if eager() and is_kept() else within)(*args, **kwargs)
+
+    return cast(F, call)
+
+
 def interactive(fn: F, often: bool = False, host: bool = False) -> F:
     """`equinox.filter_jit` for what a user calls and waits for: compiled quickly, where it is not part of another
     program; less so if it is called `often`. With `host` it returns NumPy's arrays: every operation that Python applies

@@ -3,13 +3,12 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from .._numerics._compile import eager
+from .._numerics._compile import eager, long_running
 from .._numerics._progress import Counting, ProgressMeter, QUIET, Told
 from .._numerics._text import known, positive
 from ._chunks import in_chunks
@@ -23,7 +22,7 @@ PIECES = 64  # of a sweep, from which on a piece is of several chunks: each cost
 
 Tell = Callable[[int], Any]
 
-_run = eqx.filter_jit(in_chunks)
+_run = long_running(in_chunks)
 
 
 def sweep(
