@@ -65,7 +65,7 @@ def _between(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Parameter and multipliers between the points `i` and `i + 1`; none where these cannot be told."""
     nothing = x[:0], rows[:0]
-    good = np.all([_conjugate(rows[:, pair]) for pair in pairs], axis=0)
+    good = np.stack([_conjugate(rows[:, pair]) for pair in pairs]).all(axis=0)
     if not good[i : i + 2].all():
         return nothing
     near = _window(good, i)
