@@ -55,7 +55,7 @@ def _splits(pair: Complex[np.ndarray, "points 2"]) -> Iterator[int]:
 
 def _conjugate(pair: Complex[np.ndarray, "points 2"]) -> np.ndarray:
     """Whether two are finite, and both real or conjugate to each other."""
-    good = np.isfinite(pair).all(axis=1)
+    good = np.isfinite(pair[:, 0]) & np.isfinite(pair[:, 1])
     a, b = np.where(good[:, None], pair, 0.0).T
     return good & (np.abs(np.imag(a + b)) + np.abs(np.imag(a * b)) <= REAL * (1 + np.abs(a * b)))
 
@@ -65,7 +65,7 @@ def _between(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Parameter and multipliers between the points `i` and `i + 1`; none where these cannot be told."""
     nothing = x[:0], rows[:0]
-    good = np.stack([_conjugate(rows[:, pair]) for pair in pairs]).all(axis=0)
+    good = np.logical_and.reduce([_conjugate(rows[:, pair]) for pair in pairs])
     if not good[i : i + 2].all():
         return nothing
     near = _window(good, i)
