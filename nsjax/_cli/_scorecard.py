@@ -246,6 +246,7 @@ ORBITS = {
 # Families of A.9, which take minutes: followed where they are asked for, and not with the others.
 EIGHT = 2e-8  # by shooting with scipy, where the test function of a point hardly changes
 FAMILIES = {f"A.9 {name}": name for name in ("P1", "P2 to P4", "P5 and P6")}
+PARTS = {"P1": (1.99, 2.3), "P5 and P6": (2.5424, 2.58)}  # on the branch through the start, with all points below
 POINTS = (
     Point("(5.7)", "saddle-node", "saddle-node", 0.0, "(5.7)"),
     Point("(5.8)", "discontinuous saddle-node", "discontinuous saddle-node", 0.0, "(5.8)"),
@@ -331,7 +332,8 @@ def special_points(key: str) -> tuple[tuple[float, str], ...]:
 
 
 def followed(name: str) -> OrbitBranch:
-    """A family of A.9, as `continue A.9` follows it."""
+    """A family of A.9, as `continue A.9` follows it; or the part that has the points of the table, in longer steps:
+    special points are found to the same digits between them."""
     family = next(family for family in STICK_SLIP_WHIRL if family.name == name)
     entry = gallery.entry("A.9")
     assert entry.orbit is not None and family.interval is not None
@@ -339,11 +341,15 @@ def followed(name: str) -> OrbitBranch:
     if family.start is not None:
         begin = family.start(entry.system())
     how: dict[str, Any] = dict(rtol=1e-12, atol=1e-12)
-    orbit = find_orbit(begin.system, begin.y0, period=begin.period, **how)
     most: dict[str, Any] = {} if family.most is None else dict(max_branches=family.most)
+    if name in PARTS:
+        how |= dict(solver=diffrax.Tsit5(), max_steps=8192)
+        most = dict(max_branches=1, max_step=0.1)
+    orbit = find_orbit(begin.system, begin.y0, period=begin.period, **how)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "There are more than `max_branches`")
-        return continue_orbit(begin.system, orbit, "omega", family.interval, max_laps=family.laps, **most, **how)
+        interval = PARTS.get(name, family.interval)
+        return continue_orbit(begin.system, orbit, "omega", interval, max_laps=family.laps, **most, **how)
 
 
 def nearest(point: Point) -> tuple[float, str]:

@@ -1,9 +1,11 @@
 """Units of parameters and state components: the metadata of a field, or the comment beside it,
 `x: Array  # displacement [m]`."""
 
+import ast
 import dataclasses
 import functools as ft
 import inspect
+import linecache
 import re
 from collections import Counter
 from collections.abc import Iterable
@@ -27,14 +29,40 @@ def notes(cls: type) -> dict[str, Note]:
     for base in reversed(cls.__mro__):
         try:
             source = inspect.getsource(base)
-        except (OSError, TypeError):  # built in, or typed at a prompt
-            continue
+        except (OSError, TypeError):  # built in, or typed into a notebook
+            source = _typed(base) if base.__module__ == "__main__" else ""
         found |= {name: Note(meaning, unit or "") for name, meaning, unit in _FIELD.findall(source)}
     for field in dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ():
         told = {key: str(field.metadata[key]) for key in Note._fields if key in field.metadata}
         if told:
             found[field.name] = found.get(field.name, Note())._replace(**told)
     return found
+
+
+def _typed(cls: type) -> str:
+    """The source of a class that is in no file. IPython keeps the text of cells in `linecache`, and the functions of a
+    class name the cell that they come from. A class without functions (a `NamedTuple`) does not: for it, the newest
+    text that defines a class with this name and these fields."""
+    places = [(f.__code__.co_filename, f.__code__.co_firstlineno) for f in vars(cls).values() if inspect.isfunction(f)]
+    fields, best, source = list(inspect.get_annotations(cls)), False, ""
+    for file, entry in list(linecache.cache.items()):
+        if len(entry) == 1 or entry[1] is not None:  # of a file: only these have a time
+            continue
+        try:
+            nodes = ast.walk(ast.parse("".join(entry[2])))
+        except (SyntaxError, ValueError):
+            continue
+        for node in nodes:
+            if not isinstance(node, ast.ClassDef) or node.name != cls.__name__:
+                continue
+            if [ast.unparse(line.target) for line in node.body if isinstance(line, ast.AnnAssign)] != fields:
+                continue
+            lines = range(node.lineno, (node.end_lineno or node.lineno) + 1)
+            here = any(name == file and line in lines for name, line in places)
+            if here >= best:
+                # Whole lines: a node ends before the comment that stands behind it.
+                best, source = here, "".join(entry[2][lines.start - 1 : lines.stop - 1])
+    return source
 
 
 def time_unit(units: Iterable[str]) -> str:

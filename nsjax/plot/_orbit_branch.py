@@ -14,6 +14,7 @@ from ..derivatives._floquet import trivial
 from ..setvalued._eigenvalue_crossings import eigenvalue_path as path_between
 from ._diagram import begun, LINE, mark, stretches, UNSTABLE, wording, write_names
 from ._eigenvalues import eigenvalue_path
+from ._multiplier_pair import with_splits
 from ._path import chosen
 from ._style import axes_or_new, axis_label, declared, Labels, legend as add_legend, once
 
@@ -107,7 +108,8 @@ def multiplier_diagram(
     (1 - q) M₁ + q M₂ at that value of the parameter; Figs. 6.13, 6.19 and 6.22.
 
     The multiplier 1 that an autonomous system always has is left out, and so are virtual branches. Infinite ones lie on
-    the upper edge.
+    the upper edge. Where a complex pair becomes real the lines are interpolated as a square root; elsewhere they are
+    straight between computed points.
 
     **Arguments:**
 
@@ -308,10 +310,11 @@ def _lines(branch: OrbitBranch, autonomous: bool, which: str) -> Iterator[tuple[
     cuts = _cuts(branch)
     for start, stop in zip([0, *cuts], [*cuts, len(branch)]):
         if stop > start:
-            rows = values[start:stop]
-            columns = rows.T[:1] if which == "largest" else _followed(rows).T
-            for column in columns:
-                yield branch.values[start:stop], column, kinds[start:stop]
+            x, rows, kind = with_splits(branch.values[start:stop], _followed(values[start:stop]), kinds[start:stop])
+            if which == "largest":
+                rows = np.take_along_axis(rows, np.argmax(np.abs(rows), axis=1)[:, None], axis=1)
+            for column in rows.T:
+                yield x, column, kind
 
 
 def _cuts(branch: OrbitBranch) -> list[int]:

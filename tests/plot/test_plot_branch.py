@@ -12,6 +12,7 @@ from nsjax import gallery, plot
 from nsjax.continuation import OrbitHalfBranch
 from nsjax.maps._brute_force import BruteForce
 from nsjax.plot._diagram import write_names
+from nsjax.plot._multiplier_pair import with_splits
 from nsjax.plot._style import legend
 
 
@@ -158,6 +159,58 @@ def test_multipliers_are_followed_not_sorted(forced):
     ax = plot.multiplier_diagram(forced, part="real", which="largest")
     assert [tuple(line[-1]) for line in lines(ax, "unstable periodic orbit")] == [(1.9, -1.0)]
     assert len(lines(ax, "jump of the multipliers")) == 2
+
+
+def pair_over(c):
+    """Multipliers of x'' + 2 c x' + x = 0 after three units of time, which are real for c >= 1."""
+    root = np.sqrt(np.asarray(c)[..., None].astype(complex) ** 2 - 1) * [1, -1]
+    return np.exp(3 * (root - np.asarray(c)[..., None]))
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_pair_splits_as_a_square_root(way):
+    """Of the closed form trace and determinant hold at each new point: straight lines are off by 2e-3. Beside the split
+    there are new points in three intervals, in the others none."""
+    c = np.linspace(0.9, 1.13, 12)[::way]
+    x, rows, kinds = with_splits(c, pair_over(c)[:, ::way], np.arange(12))
+    assert len(x) == 12 + 2 * 15 + 31 and np.isin(c, x).all() and np.all(way * np.diff(x) > 0)
+    assert np.all(np.diff(kinds) >= 0) and (np.unique(kinds) == np.arange(12)).all()
+    exact = pair_over(x)
+    np.testing.assert_allclose(rows.sum(axis=1), exact.sum(axis=1), atol=2e-6)
+    np.testing.assert_allclose(rows.prod(axis=1), exact.prod(axis=1), atol=2e-7)
+    split = np.argmin(np.abs(rows[:, 0] - rows[:, 1]))
+    assert abs(x[split] - 1) < 1e-5 and np.abs(rows[split, 0] - rows[split, 1]) < 1e-6
+    assert np.abs(np.diff(rows, axis=0)).max() < 0.02  # each column goes on
+
+
+def test_a_pair_splits_beside_a_fold_of_the_branch():
+    """The parameter turns back, where trace and determinant go on. Where orbits stick there are two zeros, which are no
+    pair though rounding makes them one; an infinite multiplier stays as it is."""
+    trace = np.linspace(0.7, 1.7, 11)
+    root = np.sqrt((trace**2 - 1.6 - 0.4 * (trace - 1.2)).astype(complex)) / 2
+    zeros = 1e-17 * np.array([1j, -1j]) * (np.arange(11)[:, None] % 2)
+    infinite = np.full(11, np.inf)
+    rows = np.column_stack([trace / 2 + root, trace / 2 - root, 0.3 + 0.1 * trace, zeros, infinite])
+    x, rows, _ = with_splits(2 - (trace - 1.32) ** 2, rows, np.arange(11))
+    assert len(x) == 11 + 2 * 15 + 31
+    trace = rows[:, :2].sum(axis=1).real
+    np.testing.assert_allclose(x, 2 - (trace - 1.32) ** 2, atol=1e-4)
+    np.testing.assert_allclose(rows[:, :2].prod(axis=1), 0.4 + 0.1 * (trace - 1.2), atol=1e-6)
+    np.testing.assert_allclose(rows[:, 2], 0.3 + 0.1 * trace, atol=2e-3)
+    assert np.abs(rows[:, 3:5]).max() < 1e-16 and np.isinf(rows[:, 5]).all()
+
+
+def test_lines_of_a_pair_that_splits():
+    c = np.linspace(0.9, 1.13, 12)
+    branch = branch_of(gallery.ForcedFriction(), "omega", c, c, pair_over(c))
+    lower, upper = sorted(lines(plot.multiplier_diagram(branch), "stable periodic orbit"), key=lambda line: line[-1, 1])
+    (largest,) = lines(plot.multiplier_diagram(branch, part="real", which="largest"), "stable periodic orbit")
+    for line, column in ((lower, 1), (upper, 0)):
+        np.testing.assert_allclose(line[np.isin(line[:, 0], c), 1], np.abs(pair_over(c))[:, column])
+        np.testing.assert_allclose(np.interp(1.015, *line.T), np.abs(pair_over(1.015))[column], atol=1e-4)
+    np.testing.assert_allclose(
+        np.interp([0.95, 1.015], *largest.T), pair_over(np.array([0.95, 1.015]))[:, 0].real, atol=1e-3
+    )
 
 
 def test_moduli(forced):
