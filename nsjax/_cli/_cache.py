@@ -25,6 +25,15 @@ def keep_compiled(keep: bool = True) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
+def compile_loops_whole() -> None:
+    """To be called before anything is compiled: XLA then makes one function of a loop of which it would make some
+    hundred kernels, each to be started by itself. A solution alone takes a quarter of the time."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_backend_extra_options" not in flags:
+        threshold = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+        os.environ["XLA_FLAGS"] = f"{flags} {threshold}".strip()
+
+
 def collect_rarely() -> None:
     """Tracing makes many objects that stay, and looking through them for garbage took a tenth of a command's time."""
     gc.freeze()

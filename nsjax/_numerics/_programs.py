@@ -54,11 +54,11 @@ def keep_programs(folder: str | os.PathLike | None = None) -> pathlib.Path:
     """From now on keeps finished programs in a folder, and looks there before it makes one: in another session, or when
     a notebook is run again, the first answer comes without tracing and compiling. The command line does this by itself.
 
-    What is kept are the programs of functions that are called directly, such as `solve`, `find_orbit` and `sweep`, on one CPU;
-    within your own `jax.jit` they are part of a program that JAX keeps (`jax_compilation_cache_dir`). One is found
-    again only if all that it was made of is the same: the code of the model with whatever it refers to, the kinds of
-    the arguments, nsjax, the libraries, the settings of JAX, the machine. If that cannot be told (of a model that uses
-    a module of yours, for instance), nothing is kept, and all works as before.
+    What is kept are the programs of functions that are called directly, such as `solve`, `find_orbit` and `sweep`, on
+    one CPU; within your own `jax.jit` they are part of a program that JAX keeps (`jax_compilation_cache_dir`). One is
+    found again only if all that it was made of is the same: the code of the model with whatever it refers to, the kinds
+    of the arguments, nsjax, the libraries, the settings of JAX, the machine. If that cannot be told (of a model that
+    uses a module of yours, for instance), nothing is kept, and all works as before.
 
     **Arguments:**
 

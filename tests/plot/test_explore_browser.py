@@ -77,7 +77,7 @@ def test_clicks_in_a_browser(server):
         page.wait_for_timeout(1000)  # until the first picture has come
         before = canvas.screenshot()
         box = canvas.bounding_box()
-        for name, number, x, y, height in places:
+        for _, number, x, y, height in places:
             page.mouse.click(box["x"] + float(x), box["y"] + float(height) - float(y))
             assert said(server, "selected")[-1] == ["selected", number, "3"]
         page.wait_for_timeout(500)
