@@ -211,9 +211,9 @@ def transversality(
     h_t, n = moved(jnp.ones_like(t), jnp.zeros_like(flat)), jax.vmap(moved, (None, 0), 1)(jnp.zeros_like(t), seeds)
     n, near = jnp.where(table < 0, 0, n), jnp.maximum(table, 0)
     # (Sums of a few columns, written out: XLA's products of so short rows take ten times as long.)
-    columns = list(zip(n.T, f[near].T, error[near].T))
-    square, along = (sum(n * (n, f)[i] for n, f, _ in columns) for i in (0, 1))
-    return _cosine(h_t, square, along, f @ f), sum(jnp.abs(n) * error for n, _, error in columns)
+    zero, columns = jnp.zeros_like(h_t), list(zip(n.T, f[near].T, error[near].T))
+    square, along = sum((n * n for n, _, _ in columns), zero), sum((n * f for n, f, _ in columns), zero)
+    return _cosine(h_t, square, along, f @ f), sum((jnp.abs(n) * error for n, _, error in columns), zero)
 
 
 def cosine(h_t: Scalar, n: Float[Array, " n"], f: Float[Array, " n"]) -> Scalar:

@@ -176,7 +176,7 @@ def _log(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, linear: Linear)
         state = curve.state(mode, part)
         h_t, n = jax.grad(lambda t, x: curve.guard(model, t, x, state, slot, entry), argnums=(0, 1))(t, x)
         f = ravel(model.flow(t, curve.unravel(x), state))
-        return cosine(h_t, n, f, f @ f)
+        return cosine(h_t, n, f)
 
     switch = jnp.asarray([slot.switch for slot in model.slots] or [-1], jnp.int32)[rows.slot]
     t, y = frozen((end[last], linear.last[last]))
