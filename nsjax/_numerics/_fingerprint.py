@@ -4,6 +4,7 @@ A program depends on the shapes of its arrays, on everything in its arguments th
 libraries, known by their versions, and that of the user, known by its instructions and by whatever these refer to.
 """
 
+import dis
 import enum
 import functools as ft
 import hashlib
@@ -24,6 +25,7 @@ KNOWN = ("jax", "jaxlib", "numpy", "scipy", "equinox", "diffrax", "optimistix", 
 PLAIN = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis), type(NotImplemented), range, slice)
 OPAQUE = (types.BuiltinFunctionType, types.MethodDescriptorType, types.WrapperDescriptorType, np.ufunc)
 SLOTS = (types.MemberDescriptorType, types.GetSetDescriptorType, type(inspect.Traceback.lineno))  # the last: of tuples
+JITTED = type(jax.jit(abs))
 # Of a class: what says nothing of its behaviour, or what other entries make.
 IGNORED = frozenset(
     "__dict__ __weakref__ __doc__ __module__ __qualname__ __annotations__ __annotate_func__ __annotations_cache__"
@@ -66,6 +68,10 @@ def _source(thing: Any) -> str | None:
 def _file_of(module: types.ModuleType) -> str | None:
     built_in = getattr(module.__spec__, "origin", None) in ("built-in", "frozen")
     return getattr(module, "__file__", None) or ("<frozen>" if built_in else None)
+
+
+def _is_known(name: str) -> bool:
+    return name in KNOWN or name in sys.stdlib_module_names
 
 
 def is_library(thing: Any) -> bool:
@@ -191,7 +197,7 @@ class Fingerprint:
         elif isinstance(value, types.CellType):
             self._write("cell")
             self._all(_content(value))
-        elif callable(value) and hasattr(value, "__wrapped__") and type(value).__module__.startswith("jax"):
+        elif isinstance(value, JITTED):
             self._write("jitted")  # how it is compiled on its own says nothing of a program of which it is a part
             self.constant(value.__wrapped__)
         elif type(value).__module__ in ("typing", "types", "jaxtyping"):
@@ -227,6 +233,9 @@ class Fingerprint:
         self.constant({k: v for k, v in sorted(vars(value).items()) if k not in IGNORED})
 
     def _code(self, code: types.CodeType) -> None:
+        for step in dis.get_instructions(code):
+            if step.opname == "IMPORT_NAME" and not _is_known(str(step.argval).partition(".")[0]):
+                raise UnknownError(f"module {step.argval}, of which anything may be used")
         names = (code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
         self._write("code", code.co_flags, code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount)
         self._all((code.co_code, code.co_exceptiontable, names, code.co_consts))

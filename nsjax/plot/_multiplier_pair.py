@@ -8,9 +8,8 @@ from jaxtyping import Complex, Float, Int
 
 
 SAMPLES = 16  # between two computed points, or one and the place where a pair splits
-ROUNDING = (
-    1e-12  # of the square of a multiplier: two that are zero, as where an orbit sticks, may be a pair by rounding
-)
+# Of the square of a multiplier: two that are zero, as where an orbit sticks, may be a pair by rounding.
+ROUNDING = 1e-12
 REAL = 1e-9  # is what has no larger imaginary part
 CLOSE = 1e-6  # to each other are two of four points, over the others, through which no cubic is drawn
 

@@ -178,6 +178,37 @@ def test_objects_that_refer_to_themselves():
     assert print_of(again) == print_of(again)
 
 
+def test_rules_of_derivatives_are_code_too():
+    def ruled(factor):
+        @jax.custom_jvp
+        def fn(x):
+            return x
+
+        fn.defjvp(lambda primals, tangents: (fn(*primals), factor * tangents[0]))
+        return fn
+
+    assert print_of(ruled(1.0)) == print_of(ruled(1.0)) != print_of(ruled(2.0))
+    assert print_of(jax.jit(ruled(1.0))) != print_of(jax.jit(ruled(2.0)))
+
+
+def test_modules_that_are_imported_within_a_function():
+    def ours():
+        import math
+
+        import jax.numpy
+
+        return math, jax.numpy
+
+    def theirs():
+        import helpers_of_a_user  # pyright: ignore[reportMissingImports]
+
+        return helpers_of_a_user
+
+    assert print_of(ours) == print_of(ours)
+    with pytest.raises(UnknownError, match="helpers_of_a_user"):
+        print_of(theirs)
+
+
 def test_sets_have_no_order():
     words = [f"word {i}" for i in range(20)]
     assert print_of(frozenset(words), traced=False) == print_of(frozenset(reversed(words)), traced=False)
