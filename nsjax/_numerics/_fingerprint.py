@@ -25,7 +25,7 @@ KNOWN = ("jax", "jaxlib", "numpy", "scipy", "equinox", "diffrax", "optimistix", 
 PLAIN = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis), type(NotImplemented), range, slice)
 OPAQUE = (types.BuiltinFunctionType, types.MethodDescriptorType, types.WrapperDescriptorType, np.ufunc)
 SLOTS = (types.MemberDescriptorType, types.GetSetDescriptorType, type(inspect.Traceback.lineno))  # the last: of tuples
-JITTED = type(jax.jit(abs))
+JITTED: Any = type(jax.jit(abs))
 # Of a class: what says nothing of its behaviour, or what other entries make.
 IGNORED = frozenset(
     "__dict__ __weakref__ __doc__ __module__ __qualname__ __annotations__ __annotate_func__ __annotations_cache__"
