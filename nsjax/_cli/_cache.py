@@ -1,4 +1,4 @@
-"""What a command does to start quickly: it keeps programs from one call to the next."""
+"""What a command does to be quick: it keeps programs from one call to the next, and has loops compiled whole."""
 
 import gc
 import os
@@ -15,12 +15,13 @@ def keep_compiled(keep: bool = True) -> None:
     if not keep:
         jax.config.update("jax_enable_compilation_cache", False)
         return
-    folder = jax.config.values.get("jax_compilation_cache_dir")
+    given = jax.config.values.get("jax_compilation_cache_dir")
     try:
-        folder = str(keep_programs(folder))
+        folder = keep_programs(None if given and "://" in given else given)  # JAX may keep its own in a bucket
     except OSError:  # a home that cannot be written to: every command compiles for itself
         return
-    jax.config.update("jax_compilation_cache_dir", folder)
+    if not given:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 

@@ -259,8 +259,8 @@ def first_roots(
 
     def look(carry: tuple) -> tuple:
         begin, found, root = carry
-        wanted = begin + 1 + jnp.arange(FEW, dtype=jnp.int32)
-        place = jnp.searchsorted(rank, wanted, method="compare_all")  # past the last one: dropped
+        ranks = begin + 1 + jnp.arange(FEW, dtype=jnp.int32)
+        place = jnp.searchsorted(rank, ranks, method="compare_all")  # past the last one: dropped
         new = jax.vmap(first_root)([x.at[place].get(mode="clip") for x in a])
         found, root = (x.at[place].set(y, mode="drop") for x, y in zip((found, root), new))
         return begin + FEW, found, root

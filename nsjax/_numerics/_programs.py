@@ -59,8 +59,8 @@ def keep_programs(folder: str | os.PathLike | None = None) -> pathlib.Path:
     one CPU; within your own `jax.jit` they are part of a program that JAX keeps (`jax_compilation_cache_dir`). One is
     found again only if all that it was made of is the same: the code of the model with whatever it refers to, the kinds
     of the arguments, nsjax, the libraries, the settings of JAX, the machine. If that cannot be told (of a model that
-    uses a module of yours, for instance), nothing is kept, and all works as before. What a model
-    reads while it is traced, files or the clock, is not looked at: read it before, into fields or constants.
+    uses a module of yours, for instance), nothing is kept, and all works as before. What a model reads while it is
+    traced, files or the clock, is not looked at: read it before, into fields or constants.
 
     **Arguments:**
 
