@@ -18,7 +18,6 @@ from ._cli import (
     BOUNDS,
     branch_record,
     collect_rarely,
-    compile_loops_whole,
     controller,
     Diagram,
     diagram_for,
@@ -253,7 +252,6 @@ def _run_command(args: argparse.Namespace) -> int:
 
 def command() -> NoReturn:
     """The whole of a process. It ends at once: to take JAX apart takes a second, in which nothing is told."""
-    compile_loops_whole()
     status = main()
     sys.stdout.flush()
     sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""What a command does to be quick: it keeps programs from one call to the next, and has loops compiled whole."""
+"""What a command does to be quick: it keeps programs from one call to the next."""
 
 import gc
 import os
@@ -24,15 +24,6 @@ def keep_compiled(keep: bool = True) -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-
-
-def compile_loops_whole() -> None:
-    """To be called before anything is compiled: XLA then makes one function of a loop of which it would make some
-    hundred kernels, each to be started by itself. A solution alone takes a quarter of the time."""
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "xla_backend_extra_options" not in flags:
-        threshold = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
-        os.environ["XLA_FLAGS"] = f"{flags} {threshold}".strip()
 
 
 def collect_rarely() -> None:

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from ._programs import is_kept, Programs
+from ._whole_loops import whole_loops
 
 
 try:
@@ -45,22 +46,21 @@ def eager() -> bool:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# The older emitters of XLA's CPU compiler take a third to a half off its time. In batches their programs are up to 1.4
-# times slower: those are compiled by the user's own `jax.jit`, or by `nsjax.sweep`, without them. Nothing of LLVM's
-# optimisation takes another quarter to a half; what is called for every point of a branch runs a fifth slower by it.
-QUICK = {"xla_cpu_use_fusion_emitters": False}
-QUICKEST = {**QUICK, "xla_backend_optimization_level": 0}
+# The older emitters of XLA's CPU compiler take a third to a half off its time, and nothing of LLVM's optimisation
+# another third. With loops as one function a solution runs twice as fast all the same; with all optimisation it is
+# three times. In batches such programs are slower: those are compiled by the user's own `jax.jit`, or by `nsjax.sweep`.
+QUICK = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
 
 
 @ft.cache
-def _options(often: bool) -> dict[str, Any]:
+def _options() -> dict[str, Any]:
     """Those that this version of XLA knows."""
-    wanted, trivial = QUICK if often else QUICKEST, jax.jit(lambda x: x).lower(0.0)
+    trivial = jax.jit(lambda x: x).lower(0.0)
     known: dict[str, Any] = {}
     with contextlib.suppress(Exception):  # nearly always all of them
-        trivial.compile(dict(wanted))
-        return dict(wanted)
-    for name, value in wanted.items():
+        trivial.compile(dict(QUICK))
+        return dict(QUICK)
+    for name, value in QUICK.items():
         with contextlib.suppress(Exception):
             trivial.compile({name: value})
             known[name] = value
@@ -97,24 +97,25 @@ def long_running(fn: F) -> F:
     return cast(F, call)
 
 
-def interactive(fn: F, often: bool = False, host: bool = False) -> F:
+def interactive(fn: F, host: bool = False) -> F:
     """`equinox.filter_jit` for what a user calls and waits for: compiled quickly, where it is not part of another
-    program; less so if it is called `often`. With `host` it returns NumPy's arrays: every operation that Python applies
-    to one of JAX's is compiled as a program of its own."""
+    program. With `host` it returns NumPy's arrays: every operation that Python applies to one of JAX's is compiled as a
+    program of its own."""
     jit: Any = eqx.filter_jit
     within = jit(fn)
 
     @ft.cache  # not on import: which options there are is found out by compiling
     def alone() -> Any:
-        return jit(fn, compiler_options=_options(often))
+        return jit(fn, compiler_options=_options())
 
-    kept = Programs(fn, lambda: _options(often))
+    kept = Programs(fn, _options)
 
     @ft.wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
         # The options can only be given to the outermost program.
-        run = kept if eager() and is_kept() else alone() if outermost() else within
-        with without_collection():
+        mine = outermost()
+        run = kept if eager() and is_kept() else alone() if mine else within
+        with without_collection(), whole_loops(mine):
             found = run(*args, **kwargs)
         return on_host(found) if host else found
 

@@ -366,4 +366,4 @@ def _evaluated(dense: Any, span: tuple[Scalar, Scalar], t: Array, left: bool) ->
 
 
 # Called directly it is one small program: each of its operations by itself would be compiled too.
-_evaluated_alone = interactive(_evaluated, often=True)
+_evaluated_alone = interactive(_evaluated)

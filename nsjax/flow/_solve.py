@@ -1,6 +1,5 @@
 """`solve`: the flow from one time to another, as one flat loop."""
 
-import functools as ft
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -52,7 +51,7 @@ class _Options(NamedTuple):
     still: bool = False  # whether only the state at the end has derivatives
 
 
-@ft.partial(interactive, often=True)
+@interactive
 def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> Solution:
     def run(system: System, t0: Scalar, t1: Scalar, y0: Y) -> Solution:
         return _integrate(system, t0, t1, y0, options)

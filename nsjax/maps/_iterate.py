@@ -1,7 +1,6 @@
 """Maps of a solution onto itself, applied over and over: Poincaré maps and what they give."""
 
 import abc
-import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -153,7 +152,7 @@ def _named(model: SwitchedSystem) -> tuple[bool, ...]:
     return tuple(k in model.contacts or not isinstance(s, impact) for k, s in enumerate(model.switches))
 
 
-@ft.partial(interactive, often=True)
+@interactive
 def _apply(
     step: PoincareMap, system: System, t0: Scalar, y0: Y, given: dict[str, Any], number: int | None, each: int
 ) -> Iterate:

@@ -1,6 +1,5 @@
 """Lyapunov exponents: how fast neighbouring solutions part on average, by orthogonalisation along the flow."""
 
-import functools as ft
 from typing import Any, cast
 
 import diffrax as dfx
@@ -146,7 +145,7 @@ def _orthogonalised(w: Array) -> tuple[Array, Array]:
     return q, jnp.where(nothing, -jnp.inf, jnp.log(jnp.where(nothing, 1, size)))
 
 
-@ft.partial(interactive, often=True)
+@interactive
 def _follow(
     step: Advance,
     system: System,

@@ -1,6 +1,5 @@
 """The reduced map of Fig. 6.23: of one component of the state, the others being periodic."""
 
-import functools as ft
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -136,7 +135,7 @@ class _Span(NamedTuple):
     integrator: Integrator
 
 
-@ft.partial(interactive, often=True)
+@interactive
 def _reduced(
     parameters: tuple[System, Scalar, Scalar], guess: Y, place: int, span: _Span, newton: Newton
 ) -> ReducedIterate:

@@ -1,6 +1,5 @@
 """What is seen of a point of a curve of orbits: its direction, its multipliers, what its guards do along the way."""
 
-import functools as ft
 from typing import Any, NamedTuple
 
 import jax
@@ -97,7 +96,7 @@ def correct(
     return _correct(curve.fixed, itinerary, plane, guess, looks)[0] if spoilt else found
 
 
-@ft.partial(interactive, often=True)
+@interactive
 def _correct(
     curve: OrbitCurve, itinerary: OrbitItinerary, plane: Plane, guess: Array, newton: Array
 ) -> tuple[PointData, Bool[Array, ""]]:

@@ -1,0 +1,85 @@
+"""Loops as one function: where they are asked for, where XLA can, and nowhere else."""
+
+import jax
+import jax.numpy as jnp
+import jaxlib
+import numpy as np
+import pytest
+
+from nsjax._numerics import _whole_loops
+from nsjax._numerics._compile import interactive, MANY
+from nsjax._numerics._whole_loops import whole_loops
+
+
+def climb(x):
+    return jax.lax.while_loop(lambda x: jnp.sum(x) < 50, lambda x: x + jnp.sin(x) ** 2 + 0.1, x)
+
+
+def sorted_climb(x):
+    return jax.lax.while_loop(lambda x: jnp.sum(x) < 50, lambda x: jnp.sort(x + jnp.sin(x) ** 2 + 0.1), x)
+
+
+def is_whole(fn, *args, **options):
+    """Whether XLA's final program of a function has a loop as one function."""
+    fresh = lambda *args: fn(*args)  # noqa: E731  (JAX keeps what it has compiled of the same one)
+    return "xla_cpu_small_call" in jax.jit(fresh).lower(*args).compile(options or None).as_text()
+
+
+X = np.linspace(0, 1, 200)  # too large for what XLA takes for small by itself
+
+tried = pytest.mark.skipif(not jaxlib.__version__.startswith("0.10."), reason="what XLA does is not documented")
+
+
+@tried
+def test_loops_are_whole_within_and_not_outside():
+    assert not is_whole(climb, X)
+    with whole_loops():
+        assert is_whole(climb, X)
+        assert is_whole(climb, X, xla_backend_optimization_level=0)  # beside other options
+        assert not is_whole(sorted_climb, X)  # which XLA would have to call
+        with whole_loops(False):
+            assert not is_whole(climb, X)
+        with pytest.raises(jax.errors.JaxRuntimeError):
+            is_whole(climb, X, xla_no_such_option=True)
+    assert not is_whole(climb, X)
+
+
+def test_numbers_are_the_same():
+    for fn in climb, sorted_climb:
+        expected = jax.jit(fn)(X)
+        with whole_loops():
+            np.testing.assert_allclose(jax.jit(lambda x, fn=fn: fn(x))(X), expected, rtol=1e-13)
+
+
+@tried
+def test_what_is_said_in_xla_flags_stands(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_backend_extra_options={_whole_loops.NAME}=0")
+    with whole_loops():
+        assert not is_whole(climb, X)
+
+
+def test_another_version_compiles_as_elsewhere(monkeypatch):
+    class Other:
+        @staticmethod
+        def ParseFromString(_):
+            raise RuntimeError("no such message")
+
+    monkeypatch.setattr(_whole_loops, "CompileOptions", Other)
+    with whole_loops():
+        assert not is_whole(climb, X)
+
+
+def test_they_are_asked_for_by_what_is_called_directly():
+    seen = []
+
+    @interactive
+    def fn(x):
+        seen.append(_whole_loops._here.wanted)
+        return climb(x)
+
+    fn(jnp.ones(3)), jax.jacfwd(fn)(jnp.ones(4)), jax.vmap(fn)(jnp.ones((3, 5)))
+    assert all(seen) and len(seen) >= 3
+    seen.clear()
+    jax.jit(fn)(jnp.ones(6)), jax.vmap(fn)(jnp.ones((MANY + 1, 7)))
+    assert not any(seen) and len(seen) >= 2
+    assert not _whole_loops._here.wanted
