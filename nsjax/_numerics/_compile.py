@@ -46,21 +46,23 @@ def eager() -> bool:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# The older emitters of XLA's CPU compiler take a third to a half off its time, and nothing of LLVM's optimisation
-# another third. With loops as one function a solution runs twice as fast all the same; with all optimisation it is
-# three times. In batches such programs are slower: those are compiled by the user's own `jax.jit`, or by `nsjax.sweep`.
-QUICK = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
+# The older emitters of XLA's CPU compiler take a third to a half off its time. In batches their programs are up to 1.4
+# times slower: those are compiled by the user's own `jax.jit`, or by `nsjax.sweep`, without them.
+OFTEN: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+# Nothing of LLVM's optimisation takes off another third. With its loop as one function a solution runs two to five
+# times as fast all the same; a product by the library for large ones would keep it from being that.
+QUICK = {**OFTEN, "xla_backend_optimization_level": 0, "xla_cpu_experimental_ynn_fusion_type": ""}
 
 
 @ft.cache
-def _options() -> dict[str, Any]:
+def _options(often: bool) -> dict[str, Any]:
     """Those that this version of XLA knows."""
-    trivial = jax.jit(lambda x: x).lower(0.0)
+    wanted, trivial = OFTEN if often else QUICK, jax.jit(lambda x: x).lower(0.0)
     known: dict[str, Any] = {}
     with contextlib.suppress(Exception):  # nearly always all of them
-        trivial.compile(dict(QUICK))
-        return dict(QUICK)
-    for name, value in QUICK.items():
+        trivial.compile(dict(wanted))
+        return dict(wanted)
+    for name, value in wanted.items():
         with contextlib.suppress(Exception):
             trivial.compile({name: value})
             known[name] = value
@@ -97,25 +99,25 @@ def long_running(fn: F) -> F:
     return cast(F, call)
 
 
-def interactive(fn: F, host: bool = False) -> F:
+def interactive(fn: F, often: bool = False, host: bool = False) -> F:
     """`equinox.filter_jit` for what a user calls and waits for: compiled quickly, where it is not part of another
-    program. With `host` it returns NumPy's arrays: every operation that Python applies to one of JAX's is compiled as a
-    program of its own."""
+    program; less so if it is called `often` and is more than one solution. With `host` it returns NumPy's arrays, as
+    every operation that Python applies to one of JAX's is compiled as a program of its own."""
     jit: Any = eqx.filter_jit
     within = jit(fn)
 
     @ft.cache  # not on import: which options there are is found out by compiling
     def alone() -> Any:
-        return jit(fn, compiler_options=_options())
+        return jit(fn, compiler_options=_options(often))
 
-    kept = Programs(fn, _options)
+    kept = Programs(fn, lambda: _options(often))
 
     @ft.wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
         # The options can only be given to the outermost program.
         mine = outermost()
         run = kept if eager() and is_kept() else alone() if mine else within
-        with without_collection(), whole_loops(mine):
+        with without_collection(), whole_loops(mine and not often):
             found = run(*args, **kwargs)
         return on_host(found) if host else found
 

@@ -12,7 +12,6 @@ from typing import Any
 import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
-from jax import Array
 from jax.interpreters import ad, batching, mlir, partial_eval as pe
 
 from ._inner import batched_outputs, Flat, mapped, moving, opened, pushed_forward, REACHED, with_zeros
@@ -42,11 +41,6 @@ def rolled(
 
     inputs = [*inner.consts, *flat]
     return bound(inputs, ft.partial(of, loop), lanes, (True,) * len(inputs))
-
-
-def apart(alone: Callable[..., Array], lanes: Callable[..., Array], *inputs: Array) -> Array:
-    """`alone(*inputs)`, and in lanes `lanes(*inputs)`, the same numbers."""
-    return bound(list(inputs), alone, lambda *inputs: [lanes(*inputs)], (True,) * len(inputs))
 
 
 def bound(inputs: list[Any], loop: Callable[..., Any], written_out: Flat, own: tuple[bool, ...]) -> Any:

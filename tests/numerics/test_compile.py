@@ -35,7 +35,8 @@ def test_the_same_within_other_programs():
     assert len(traced) == count  # compiled once
 
 
-def test_options_are_given_to_the_outermost_program_only(monkeypatch):
+@pytest.mark.parametrize("often, options", [(False, _compile.QUICK), (True, _compile.OFTEN)])
+def test_options_are_given_to_the_outermost_program_only(monkeypatch, often, options):
     """Whatever else is in the way: the compiler gets them where the function is called directly, and not elsewhere."""
     given, jit = [], _compile.eqx.filter_jit
 
@@ -49,12 +50,12 @@ def test_options_are_given_to_the_outermost_program_only(monkeypatch):
         return call
 
     monkeypatch.setattr(_compile.eqx, "filter_jit", spied)
-    fn = interactive(lambda x: jnp.cos(x))
+    fn = interactive(lambda x: jnp.cos(x), often)
     np.testing.assert_allclose(fn(jnp.ones(())), np.cos(1))
     np.testing.assert_allclose(jax.jit(fn)(jnp.ones(())), np.cos(1))
-    assert given == [{"compiler_options": _compile._options()}, {}]
+    assert given == [{"compiler_options": _compile._options(often)}, {}]
     if jaxlib.__version__.startswith("0.10."):
-        assert _compile._options() == _compile.QUICK
+        assert _compile._options(often) == options
 
 
 def test_what_is_outermost():
@@ -102,7 +103,7 @@ def test_options_that_xla_does_not_know_are_left_out(monkeypatch):
     monkeypatch.setattr(_compile, "QUICK", _compile.QUICK | {"xla_no_such_option": True})
     _compile._options.cache_clear()
     try:
-        assert "xla_no_such_option" not in _compile._options()
+        assert "xla_no_such_option" not in _compile._options(often=False)
         np.testing.assert_allclose(interactive(lambda x: 2 * x)(jnp.ones(())), 2)
     finally:
         _compile._options.cache_clear()

@@ -23,8 +23,7 @@ from ..._numerics._autodiff import frozen
 from ..._numerics._barrier import once
 from ..._numerics._bernstein import binomials, nodes, to_bernstein, to_chebyshev
 from ..._numerics._lane_cond import compact_cond
-from ..._numerics._linalg import product
-from ..._numerics._rolled import apart, rolled
+from ..._numerics._rolled import rolled
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
@@ -301,10 +300,8 @@ class RungeKutta(Stepper):
                 )
             else:
                 rows = curved(model, state, t, y, step)
-            # Written out where it can be part of a loop that is one function: XLA gives larger products to a library.
-            matrix = to_bernstein(n).T.astype(t.dtype)
-            values = jnp.stack([jnp.stack(values) for values in rows])
-            coefficients = apart(lambda x: product(x, matrix), lambda x: x @ matrix, values)
+            matrix = jnp.asarray(to_bernstein(n), t.dtype)
+            coefficients = matrix @ jnp.stack([jnp.stack(values) for values in rows], axis=1)
             for row, (i, values) in enumerate(zip(which, rows)):
                 # (Not by `jnp.max` of an array: XLA's code for that takes as long as all stages of a step.)
                 last = [sum(float(w) * v for w, v in zip(weights, values)) for weights in to_chebyshev(n)[-2:]]
@@ -313,7 +310,7 @@ class RungeKutta(Stepper):
                 noise[i].append(jnp.abs(near[i][len(out[i])] - values[0]))
                 rough = once(tail - unresolved(t.dtype) * size - noise[i][-1])
                 resolved = resolved & ~(rough > 0)
-                out[i].append(list(coefficients[row]))
+                out[i].append(list(coefficients[:, row]))
         return dict(guards=out, noise=with_multipliers(model, noise), resolved=resolved)
 
 

@@ -1,5 +1,6 @@
 """What is seen of a point of a curve of orbits: its direction, its multipliers, what its guards do along the way."""
 
+import functools as ft
 from typing import Any, NamedTuple
 
 import jax
@@ -96,7 +97,7 @@ def correct(
     return _correct(curve.fixed, itinerary, plane, guess, looks)[0] if spoilt else found
 
 
-@interactive
+@ft.partial(interactive, often=True)
 def _correct(
     curve: OrbitCurve, itinerary: OrbitItinerary, plane: Plane, guess: Array, newton: Array
 ) -> tuple[PointData, Bool[Array, ""]]:
