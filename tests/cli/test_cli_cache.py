@@ -1,4 +1,4 @@
-"""What the command line keeps, and where; and how it has loops compiled."""
+"""What the command line keeps, and where."""
 
 import pathlib
 

@@ -6,7 +6,7 @@ import jaxlib
 import numpy as np
 import pytest
 
-from nsjax._numerics import _whole_loops
+from nsjax._numerics import _compile, _whole_loops
 from nsjax._numerics._compile import interactive, MANY
 from nsjax._numerics._whole_loops import whole_loops
 
@@ -17,6 +17,12 @@ def climb(x):
 
 def sorted_climb(x):
     return jax.lax.while_loop(lambda x: jnp.sum(x) < 50, lambda x: jnp.sort(x + jnp.sin(x) ** 2 + 0.1), x)
+
+
+def product_climb(x):
+    """With a product that XLA otherwise gives to a library."""
+    a = jnp.eye(9) + 0.1
+    return jax.lax.while_loop(lambda x: jnp.sum(x) < 500, lambda x: a @ x, x[:81].reshape(9, 9) + 0.1)
 
 
 def is_whole(fn, *args, **options):
@@ -44,8 +50,15 @@ def test_loops_are_whole_within_and_not_outside():
     assert not is_whole(climb, X)
 
 
+@tried
+def test_products_are_part_of_them():
+    """With the options that direct calls have."""
+    with whole_loops():
+        assert is_whole(product_climb, X, **_compile._options(often=False))
+
+
 def test_numbers_are_the_same():
-    for fn in climb, sorted_climb:
+    for fn in climb, sorted_climb, product_climb:
         expected = jax.jit(fn)(X)
         with whole_loops():
             np.testing.assert_allclose(jax.jit(lambda x, fn=fn: fn(x))(X), expected, rtol=1e-13)
