@@ -51,9 +51,9 @@ STIFFNESS = 10.0 ** np.arange(3, 7)
 @functools.cache
 def falling(name):
     """Section 2.4 with each stiffness, at tolerances that do not show beside it; and once more with the first one at a
-    looser tolerance."""
+    looser tolerance. (Not at 1e-7, where the errors of the steps make a twentieth.)"""
     entry = gallery.entry("2.4")
-    lanes = jnp.asarray([*STIFFNESS, STIFFNESS[0]]), jnp.asarray([1e-9, 1e-9, 1e-10, 1e-11, 1e-7])
+    lanes = jnp.asarray([*STIFFNESS, STIFFNESS[0]]), jnp.asarray([1e-10, 1e-9, 1e-10, 1e-11, 1e-8])
     sol = jax.vmap(lambda e, tol: run(METHODS[name](entry.system(), e), entry.y0, 30.0, tol))(*lanes)
     return error(sol, exact("2.4", 30.0)), np.asarray(sol.stats["num_steps"])
 
@@ -77,7 +77,7 @@ def test_order_on_falling_friction(name, order):
 @pytest.mark.parametrize("name", ["linear", "banded"])
 def test_error_does_not_depend_on_the_tolerance(name):
     errors, steps = falling(name)
-    assert errors[0] > 1e-3 and abs(errors[4] / errors[0] - 1) < 0.05
+    assert errors[0] > 1e-3 and abs(errors[4] / errors[0] - 1) < 0.02
     assert steps[0] > 1.5 * steps[4]
 
 
