@@ -63,8 +63,17 @@ def _of_while(have: list[bool], params: Any, outs: int) -> list[bool]:
     return [True] * outs if any(stops) else carry
 
 
+def scan_counts(params: Any) -> tuple[int, int]:
+    """How many constants a `scan` has, and how many arrays it carries: from JAX 0.11 on a tree of its inputs says it."""
+    if "ft_in" in params:
+        consts, carry, _ = params["ft_in"].unpack()
+        return len(consts), len(carry)
+    return params["num_consts"], params["num_carry"]
+
+
 def _of_scan(have: list[bool], params: Any, outs: int) -> list[bool]:
-    first, second = params["num_consts"], params["num_consts"] + params["num_carry"]
+    first, carried = scan_counts(params)
+    second = first + carried
     carry, rest = _until_it_stays(params["jaxpr"], have[:first], have[first:second], have[second:])
     return [*carry, *rest]
 

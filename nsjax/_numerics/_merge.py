@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._graph import Graph, Handlers, Node, Packing, Value
+from ._inner import scan_counts
 from ._lane_cond import compact_cond
 from ._rolled import bound
 
@@ -101,7 +102,7 @@ def _of_while(graph: Graph, e: Any, ins: list[Value]) -> list[Value] | None:
 
 
 def _of_scan(graph: Graph, e: Any, ins: list[Value]) -> list[Value]:
-    p, n, carried = e.params, e.params["num_consts"], e.params["num_carry"]
+    p, (n, carried) = e.params, scan_counts(e.params)
     known = Packing.of_scalars(ins[:n])
     seen, others = _like(known.packed(ins[:n])), [Value(a.shape, a.dtype) for a in p["jaxpr"].in_avals[n:]]
     body = _inner(p["jaxpr"], [*seen, *others], [*known.apart(seen), *others])

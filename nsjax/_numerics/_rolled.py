@@ -80,8 +80,9 @@ def _jvp(
     return results[:count], with_zeros(results[:count], kept, results[count:])
 
 
-def _pruned(used: list[bool], eqn: Any) -> tuple[list[bool], Any]:
+def _pruned(used: list[bool], *given: Any) -> tuple[list[bool], Any]:
     """Without the results that nobody uses, and what only they need: else primals would seem to depend on tangents."""
+    eqn = given[-1]  # after which arguments are alive, in later versions of JAX
     if not any(used):
         return [False] * len(eqn.invars), None
     params = eqn.params
