@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from ._products import full_products
 from ._programs import is_kept, Programs
 from ._whole_loops import whole_loops
 
@@ -56,7 +57,9 @@ QUICK = {**OFTEN, "xla_backend_optimization_level": 0, "xla_cpu_experimental_ynn
 
 @ft.cache
 def _options(often: bool) -> dict[str, Any]:
-    """Those that this version of XLA knows."""
+    """Those that this version of XLA knows; on other devices than a CPU none of them are of use."""
+    if jax.default_backend() != "cpu":
+        return {}
     wanted, trivial = OFTEN if often else QUICK, jax.jit(lambda x: x).lower(0.0)
     known: dict[str, Any] = {}
     with contextlib.suppress(Exception):  # nearly always all of them
@@ -92,6 +95,7 @@ def long_running(fn: F) -> F:
     within: Any = eqx.filter_jit(fn)
     kept = Programs(fn, dict)
 
+    @full_products
     @ft.wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
         return (kept if eager() and is_kept() else within)(*args, **kwargs)
@@ -112,6 +116,7 @@ def interactive(fn: F, often: bool = False, host: bool = False) -> F:
 
     kept = Programs(fn, lambda: _options(often))
 
+    @full_products
     @ft.wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
         # The options can only be given to the outermost program.

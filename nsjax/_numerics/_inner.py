@@ -11,6 +11,12 @@ import jax.numpy as jnp
 from jax.interpreters import ad
 
 
+try:
+    from jax._src.interpreters.partial_eval import lower_jaxpr2
+except ImportError:  # then there are no primitives to replace
+    lower_jaxpr2 = None
+
+
 Flat = Callable[..., list[Any]]  # of arrays, to arrays
 
 
@@ -22,6 +28,17 @@ def opened(closed: jex.ClosedJaxpr) -> jex.ClosedJaxpr:
         constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars], debug_info=jaxpr.debug_info._replace(arg_names=names)
     )
     return jex.ClosedJaxpr(free, ())
+
+
+def replacing(primitive: jex.Primitive) -> None:
+    """For a primitive with a jaxpr: some functions of JAX are primitives that it replaces by others before it compiles
+    (`jnp.searchsorted`, from 0.12 on), and that may stand within."""
+
+    def replaced(*args: Any, jaxpr: jex.ClosedJaxpr, **params: Any) -> Any:
+        return primitive.bind(*args, jaxpr=lower_jaxpr2(jaxpr), **params)
+
+    if lower_jaxpr2 is not None:
+        primitive.to_lojax = replaced  # type: ignore[method-assign]
 
 
 def batched_outputs(closed: jex.ClosedJaxpr, batched: Sequence[bool]) -> list[bool]:

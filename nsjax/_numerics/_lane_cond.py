@@ -14,7 +14,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 
-from ._inner import batched_outputs, mapped, moving, opened, pushed_forward, REACHED, spread, with_zeros
+from ._inner import batched_outputs, mapped, moving, opened, pushed_forward, REACHED, replacing, spread, with_zeros
 
 
 _GROUP = 32  # lanes worked on together, at least; a kernel costs as much to start as for some hundred lanes
@@ -111,4 +111,5 @@ compact_cond_p.def_abstract_eval(_shapes)
 batching.primitive_batchers[compact_cond_p] = _batch
 ad.primitive_jvps[compact_cond_p] = _jvp
 mlir.register_lowering(compact_cond_p, mlir.lower_fun(_impl, multiple_results=True))
+replacing(compact_cond_p)
 REACHED["compact_cond"] = _reached

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 
 from ._inner import Flat, mapped, moving, pushed_forward, spread, with_zeros
+from ._products import full_products
 
 
 Levels = tuple[tuple[int, int], ...]
@@ -33,6 +34,7 @@ def in_lanes(fn: Callable[..., Any], chunk: int, *args: Any) -> Any:
     flat, tree = jax.tree.flatten(args)
     form = jax.eval_shape(lambda *xs: fn(*jax.tree.unflatten(tree, xs)), *[_one(x) for x in flat])
 
+    @full_products  # it may be traced later
     def listed(*xs: Any) -> list[Any]:
         return jax.tree.leaves(fn(*jax.tree.unflatten(tree, xs)))
 

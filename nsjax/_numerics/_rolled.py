@@ -14,7 +14,8 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir, partial_eval as pe
 
-from ._inner import batched_outputs, Flat, mapped, moving, opened, pushed_forward, REACHED, with_zeros
+from ._inner import batched_outputs, Flat, mapped, moving, opened, pushed_forward, REACHED, replacing, with_zeros
+from ._products import full_products
 
 
 rolled_p = jex.Primitive("rolled")
@@ -36,6 +37,7 @@ def rolled(
 
         return way(known, *jax.tree.unflatten(tree, inputs[count:]))
 
+    @full_products  # it may be traced later
     def lanes(*inputs: Any) -> list[Any]:
         return jax.tree.leaves(of(written_out, *inputs))
 
@@ -112,4 +114,5 @@ batching.primitive_batchers[rolled_p] = _batch
 ad.primitive_jvps[rolled_p] = _jvp
 pe.dce_rules[rolled_p] = _pruned
 mlir.register_lowering(rolled_p, mlir.lower_fun(_impl, multiple_results=True))
+replacing(rolled_p)
 REACHED["rolled"] = lambda have, params, outs: batched_outputs(params["jaxpr"], have)

@@ -242,7 +242,11 @@ def _sampled(
     rate, f1 = scale * (m @ z[-1])[: len(x)], dt * flat(t + dt, x + moves[-1])
     size = [jnp.max(jnp.abs(v)) for v in (dt * jfu.ravel_pytree(f)[0], f1, rate, eps**0.5 * jnp.max(jnp.abs(m)) * size)]
     size += [] if force is None else [force * jnp.abs(dt)]
-    fits = fits & lax.stop_gradient(jnp.max(jnp.abs(f1 - rate)) <= 1e-6 * sum(size))
+    allowed = max(1e-6, 64 * eps) * sum(size)
+    if m.shape[0] > len(x) + 1:  # forcing that depends on time is no better known than the time is
+        pace = jnp.max(jnp.abs(m[: len(x), len(x) + 1 :])) * jnp.abs(scale) / jnp.where(dt == 0, 1, jnp.abs(dt))
+        allowed = allowed + 8 * eps * jnp.abs(t + dt) * pace
+    fits = fits & lax.stop_gradient(jnp.max(jnp.abs(f1 - rate)) <= allowed)
     return [unravel(x + move) for move in moves], unravel(error), excess, fits
 
 
