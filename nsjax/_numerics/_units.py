@@ -30,7 +30,10 @@ def notes(cls: type) -> dict[str, Note]:
         try:
             source = inspect.getsource(base)
         except (OSError, TypeError):  # built in, or typed into a notebook
-            source = _typed(base) if base.__module__ == "__main__" else ""
+            source = ""
+        # (From Python 3.13 on it may be the lines with the same numbers of what was started, whatever they are.)
+        if base.__module__ == "__main__" and not re.search(rf"^\s*class {base.__name__}\b", source, re.MULTILINE):
+            source = _typed(base)
         found |= {name: Note(meaning, unit or "") for name, meaning, unit in _FIELD.findall(source)}
     for field in dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ():
         told = {key: str(field.metadata[key]) for key in Note._fields if key in field.metadata}
