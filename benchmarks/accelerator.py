@@ -13,10 +13,20 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from typing import Any, NamedTuple
 
+import diffrax
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
+from sweep import Hammer, machine
+from workloads import F_SLIP, HAMMER, K, SLIDER, T1, WORKLOADS
+
+import nsjax
+from nsjax.gallery import Motion, thesis
 
 
 DIFFERENT = 4096  # parameters
@@ -51,15 +61,6 @@ def places(lanes: int) -> np.ndarray:
 
 def ensemble(workload: str, solver: str) -> Any:
     """A function of one lane: what is wanted, the number of events, how it ended."""
-    import diffrax
-    import jax
-    import jax.numpy as jnp
-    from sweep import Hammer
-    from workloads import F_SLIP, HAMMER, K, SLIDER, T1
-
-    import nsjax
-    from nsjax.gallery import Motion, thesis
-
     method = getattr(nsjax, solver, None) or getattr(diffrax, solver)
 
     def final(system: nsjax.System, y0: Motion) -> Any:
@@ -84,12 +85,6 @@ def ensemble(workload: str, solver: str) -> Any:
 
 def child(args: argparse.Namespace) -> None:
     """Times what is asked for on the platform that the environment says, and prints a line of JSON for each."""
-    import jax
-    import jax.numpy as jnp
-    from workloads import WORKLOADS
-
-    import nsjax
-
     device = jax.devices()[0]
     kind = jnp.float64 if jax.config.read("jax_enable_x64") else jnp.float32
     exact = np.load(args.reference) if os.path.exists(args.reference) else {}
@@ -109,8 +104,6 @@ def child(args: argparse.Namespace) -> None:
                     start = time.perf_counter()
                     out = jax.block_until_ready(nsjax.sweep(fn, values, chunk=chunk))
                     seconds.append(time.perf_counter() - start)
-                    if sum(seconds[1:]) > args.enough:
-                        break
                 y, (events, result) = jax.tree.map(np.asarray, out)
                 if workload not in kept and lanes == DIFFERENT:
                     kept |= {workload: y, f"{workload} events": events, f"{workload} result": result}
@@ -143,6 +136,21 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def picture(rows: list[dict[str, Any]]) -> plt.Figure:
+    """Throughput of S1 by Taylor against the number of lanes."""
+    figure, ax = plt.subplots(figsize=(6, 4), layout="constrained")
+    own = sorted((r for r in map(lambda row: Row(**row), rows) if (r.workload, r.solver) == ("S1", "Taylor")), key=str)
+    for i, device in enumerate(sorted({r.device for r in own})):
+        for precision, line in (("float64", "-"), ("float32", "--")):
+            here = sorted((r.lanes, r.lanes / r.seconds) for r in own if (r.device, r.precision) == (device, precision))
+            if here:
+                ax.plot(*zip(*here), line, marker="o", color=f"C{i}", label=f"{device}, {precision}")
+    ax.set(xscale="log", yscale="log", xlabel="lanes [-]", ylabel="throughput [lanes/s]")
+    ax.grid(True, which="major", color="0.9")
+    ax.legend(fontsize="small", frameon=False)
+    return figure
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workload", nargs="+", default=["S1"], choices=("S1", "S2", "S3"))
@@ -152,25 +160,20 @@ def main() -> None:
     parser.add_argument("--precision", nargs="+", default=["float64", "float32"], choices=("float64", "float32"))
     parser.add_argument("--most", type=int, default=4096, help="lanes on the CPU")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--enough", type=float, default=20.0, help="seconds of runs after which there is no other one")
     parser.add_argument("--seconds", type=float, default=1e9, help="after which nothing new is begun")
-    parser.add_argument("--out", help="where to write the numbers as JSON; what is there stays")
+    parser.add_argument("--out", help="where to write the numbers as JSON, and the picture")
     parser.add_argument("--until", type=float, help=argparse.SUPPRESS)
     parser.add_argument("--reference", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.until is not None:
         return child(args)
-    import tempfile
-
     until = time.time() + args.seconds
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         runs = [(p, x) for p in args.platform for x in args.precision]
         reference = [("cpu", "float64", ["Dopri8"], [DIFFERENT])]
-        own = [
-            (p, x, args.solver, args.lanes if p != "cpu" else [n for n in args.lanes if n <= args.most])
-            for p, x in runs
-        ]
+        few = [n for n in args.lanes if n <= args.most]
+        own = [(p, x, args.solver, few if p == "cpu" else args.lanes) for p, x in runs]
         for platform, precision, solvers, lanes in reference + own:
             environment = os.environ | {
                 "JAX_PLATFORMS": platform if platform == "cpu" else f"{platform},cpu",
@@ -178,17 +181,19 @@ def main() -> None:
             }
             command = [sys.executable, __file__, "--until", str(until), "--reference", f"{folder}/reference.npz"]
             command += ["--workload", *args.workload, "--solver", *solvers, "--lanes", *map(str, lanes)]
-            command += ["--repeats", str(args.repeats), "--enough", str(args.enough)]
+            command += ["--repeats", str(args.repeats)]
             with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
                 for line in process.stdout or ():
                     rows.append(json.loads(line))
                     print(table(rows[-1:]).splitlines()[-1], flush=True)
                     if args.out:
                         with open(args.out, "w") as file:
-                            json.dump({"rows": rows}, file, indent=1)
+                            json.dump({"machine": machine(), "rows": rows}, file, indent=1)
             if process.returncode:
                 print(f"{platform}, {precision}: ended with {process.returncode}", flush=True)
     print(f"\n{table(rows)}")
+    if args.out:
+        picture(rows).savefig(os.path.splitext(args.out)[0] + ".png", dpi=120)
 
 
 if __name__ == "__main__":

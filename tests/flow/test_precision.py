@@ -64,6 +64,18 @@ def test_ball_in_single_precision(dt0):
     assert jax.vmap(sol)(t).x.min() > -1e-6
 
 
+@pytest.mark.parametrize("solver", [nsjax.Exponential(), pytest.param(nsjax.Affine(), marks=pytest.mark.slow)])
+def test_forced_for_long_in_single_precision(solver):
+    """Forcing is of a known kind at late times too, where its phase is rounded."""
+    model, y0 = Hammer(b=0.0, c=0.2, x_w=-0.5, omega=2.8), Motion(0.5, -1.0)
+    exact = solve(model, 0.0, 100.0, y0, solver=nsjax.Exponential())
+    sol = solve(single(model), 0.0, 100.0, single(y0), solver=solver)
+    assert sol.y1.x.dtype == jnp.float32 and len(exact.events) > 5
+    assert itinerary(sol) == itinerary(exact)
+    np.testing.assert_allclose(times(sol), times(exact), atol=1e-3)
+    np.testing.assert_allclose(flat(sol.y1), flat(exact.y1), atol=1e-3)
+
+
 def test_jax_as_it_comes():
     """Where nobody has called for 64 bits there are not even integers of them."""
     exact = reference.simulate(reference.StickSlip(), 20.0, (2.5, -0.5))

@@ -21,7 +21,8 @@ from ._turn import many, picked, saves, turn
 
 
 _KEPT = 3  # tables a lane, at most
-_BYTES = 2**20  # of the tables of the lanes that are run together
+_IN_CACHE = 256, 2**20  # lanes that are run together, at most, and bytes of their tables, on a CPU
+_IN_MEMORY = 65_536, 2**30  # and on other devices, which want many lanes at once
 
 
 def exactly(flow: Flow, carry: Carry) -> Carry:
@@ -29,8 +30,9 @@ def exactly(flow: Flow, carry: Carry) -> Carry:
     first = carry.state
     plan = made(flow, first, carry.t, carry.y)
     kept = min(numbers(flow.model), _KEPT)
+    lanes, room = _IN_CACHE if jax.default_backend() == "cpu" else _IN_MEMORY
     size = kept * max(1, len(plan.rows)) * (DEGREE + 1) * plan.width * carry.t.dtype.itemsize
-    chunk = max(32, min(256, _BYTES // size))
+    chunk = max(32, min(lanes, room // size))
     dynamic, static = eqx.partition((flow, carry), eqx.is_array)
 
     def run(dynamic: Any) -> Any:
