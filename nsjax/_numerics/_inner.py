@@ -14,7 +14,7 @@ from jax.interpreters import ad
 try:
     from jax._src.interpreters.partial_eval import lower_jaxpr2
 except ImportError:  # then there are no primitives to replace
-    lower_jaxpr2 = None
+    lower_jaxpr2: Any = None
 
 
 Flat = Callable[..., list[Any]]  # of arrays, to arrays
@@ -81,7 +81,7 @@ def _of_while(have: list[bool], params: Any, outs: int) -> list[bool]:
 
 
 def scan_counts(params: Any) -> tuple[int, int]:
-    """How many constants a `scan` has, and how many arrays it carries: from JAX 0.11 on a tree of its inputs says it."""
+    """How many constants a `scan` has, and how many arrays it carries: from JAX 0.11 on a tree says it."""
     if "ft_in" in params:
         consts, carry, _ = params["ft_in"].unpack()
         return len(consts), len(carry)

@@ -20,7 +20,7 @@ def full_products(fn: F) -> F:
 
     @ft.wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if jax.config.jax_default_matmul_precision is not None:
+        if getattr(jax.config, "jax_default_matmul_precision", None) is not None:
             return fn(*args, **kwargs)
         with jax.default_matmul_precision("highest"):
             return fn(*args, **kwargs)

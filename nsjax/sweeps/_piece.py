@@ -1,6 +1,8 @@
 """A piece of a sweep: some chunks of lanes, by one program that is compiled once for each device."""
 
 import collections
+import contextlib
+import functools as ft
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._numerics._compile import without_collection
+from .._numerics._whole_loops import on_request, Request
 from ._devices import Device
 from ._lanes import Lanes
 
@@ -28,16 +31,19 @@ MOST = 16  # chunks: so many that handing a piece out costs little, so few that 
 class Piece:
     """Up to `chunks` chunks of `chunk` lanes, as many as there are.
 
-    The program does not know how many lanes there are in all, nor who computes the others. So a lane has the same bits
-    whichever device, thread or process it falls to, and whatever was done before.
+    The program does not know how many lanes there are in all (but that there are `many`), nor who computes the others.
+    So a lane has the same bits whichever device, thread or process it falls to, and whatever was done before.
     """
 
-    def __init__(self, fn: Callable[..., Any], lanes: Lanes, chunk: int, chunks: int, devices: Sequence[Device]):
+    def __init__(
+        self, fn: Callable[..., Any], lanes: Lanes, chunk: int, chunks: int, devices: Sequence[Device], many: bool
+    ):
         self.chunk, self.size, self.platform = chunk, chunk * chunks, devices[0].platform
         # What is the same for all pieces is brought to each device once.
         self._shared, static = eqx.partition((fn, lanes.rest), eqx.is_array)
         self._there: dict[Device, Any] = {}
-        self.program = _program_for(static, self._shared, lanes.mapped, chunk, chunks, tuple(devices))
+        how = chunk, chunks, tuple(devices), many
+        self.program = _program_for(static, self._shared, lanes.mapped, how)
 
     def run(self, mapped: Any, device: Device) -> list[np.ndarray]:
         """The leaves of what `fn` returns, for up to `size` lanes. Each device has a thread that calls it."""
@@ -68,14 +74,15 @@ class Program:
     - `tree`, `forms`: the structure of what `fn` returns, and the shapes and dtypes of its leaves for one lane.
     """
 
-    def __init__(self, function: Callable[..., Any], forms: Any, devices: Sequence[Device]):
+    def __init__(self, function: Callable[..., Any], forms: Any, devices: Sequence[Device], many: bool):
         def placed(device: Device) -> Any:
             place = jax.sharding.SingleDeviceSharding(device)
             kind = jax.ShapeDtypeStruct
             return jax.tree.map(lambda x: kind(x.shape, x.dtype, sharding=place, weak_type=x.weak_type), forms)
 
         jitted = jax.jit(function)
-        with without_collection():
+        self._on_request = ft.partial(on_request, Request()) if many else contextlib.nullcontext
+        with without_collection(), self._on_request():
             # Lowered here and not in the threads, which do not see settings that are made by `with jax.enable_x64():`.
             traced = [jitted.trace(*placed(device)) for device in devices]
             lowered = [one.lower() for one in traced]
@@ -96,17 +103,17 @@ class Program:
         """Compiled for a device, on the first call."""
         with self._locks[device]:
             if device not in self._compiled:
-                self._compiled[device] = self._lowered.pop(device).compile()
+                with self._on_request():
+                    self._compiled[device] = self._lowered.pop(device).compile()
             return self._compiled[device]
 
 
 _kept: collections.OrderedDict[Any, Program] = collections.OrderedDict()
 
 
-def _program_for(
-    static: Any, shared: Any, mapped: Any, chunk: int, chunks: int, devices: tuple[Device, ...]
-) -> Program:
+def _program_for(static: Any, shared: Any, mapped: Any, how: tuple[int, int, tuple[Device, ...], bool]) -> Program:
     """The one of an earlier call, where all is the same, as `jax.jit` would have it."""
+    chunk, chunks, devices, many = how
 
     def form(x: Any) -> jax.ShapeDtypeStruct:
         aval = jax.typeof(x)
@@ -121,12 +128,12 @@ def _program_for(
     types = tuple((x.shape, x.dtype, x.weak_type) for x in flat)
     # (Of a number with its type: True is 1, and another program.)
     settings = trace_context() if trace_context is not None else jnp.result_type(float)
-    key = tuple((type(x), x) for x in own), own_tree, types, tree, chunk, chunks, devices, settings
+    key = tuple((type(x), x) for x in own), own_tree, types, tree, how, settings
     try:
         found = _kept.pop(key, None)
     except TypeError:  # the function holds what cannot be compared
-        return Program(_function(static, chunk, chunks), forms, devices)
-    program = found or Program(_function(static, chunk, chunks), forms, devices)
+        return Program(_function(static, chunk, chunks), forms, devices, many)
+    program = found or Program(_function(static, chunk, chunks), forms, devices, many)
     _kept[key] = program
     while len(_kept) > KEPT:
         _kept.popitem(last=False)

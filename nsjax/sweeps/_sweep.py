@@ -1,5 +1,6 @@
 """`sweep`: a function of one lane applied to many, in chunks of a size at which a processor is fastest."""
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -11,9 +12,10 @@ from jax.sharding import Mesh
 from .._numerics._compile import eager, long_running
 from .._numerics._progress import Counting, ProgressMeter, QUIET, Told
 from .._numerics._text import known, positive
+from .._numerics._whole_loops import on_request
 from ._chunks import in_chunks
 from ._devices import Device, DeviceQueue, Devices, devices_of
-from ._lanes import default_chunk, even_chunks, Lanes, lanes_of
+from ._lanes import are_many, default_chunk, even_chunks, Lanes, lanes_of
 from ._piece import MOST, Piece
 from ._sharded import sharded, spread_over
 
@@ -82,7 +84,8 @@ def sweep(
         return sharded(fn, lanes, chunk, *spread)
     if chunk is None:
         chunk = default_chunk(lanes.number, jax.default_backend())
-    return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, chunk)
+    with on_request() if are_many(lanes.number) else contextlib.nullcontext():
+        return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, chunk)
 
 
 def _counted(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices: Any, meter: ProgressMeter) -> Any:
@@ -109,16 +112,23 @@ def _handed_out(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices
     chunks, chunk = even_chunks(lanes.number, chunk)
     if not lanes.number:
         return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, 1)
-    return in_pieces(fn, lanes, chunk, min(MOST, -(-chunks // PIECES)), found, tell)
+    return in_pieces(fn, lanes, chunk, min(MOST, -(-chunks // PIECES)), found, tell, many=are_many(lanes.number))
 
 
 def in_pieces(
-    fn: Callable[..., Any], lanes: Lanes, chunk: int, together: int, found: list[Device], tell: Tell | None = None
+    fn: Callable[..., Any],
+    lanes: Lanes,
+    chunk: int,
+    together: int,
+    found: list[Device],
+    tell: Tell | None = None,
+    *,
+    many: bool,
 ) -> Any:
     """Pieces of so many chunks `together`, each on the device that is free first. `tell` is called with the number of
-    lanes that are done."""
+    lanes that are done. Of `many` the program may take longer to compile."""
     found = found[: -(-lanes.number // (chunk * together))]  # a device without a piece needs no program
-    piece, lanes = Piece(fn, lanes, chunk, together, found), lanes.on_host()
+    piece, lanes = Piece(fn, lanes, chunk, together, found, many), lanes.on_host()
     out = [np.empty((lanes.number, *form.shape), form.dtype) for form in piece.program.forms]
     starts = range(0, lanes.number, piece.size)
     with DeviceQueue(found) as each:

@@ -1,14 +1,20 @@
 """Loops as one function: where they are asked for, where XLA can, and nowhere else."""
 
+import threading
+
+import diffrax
 import jax
 import jax.numpy as jnp
 import jaxlib
 import numpy as np
 import pytest
 
+import nsjax
+from nsjax import gallery
 from nsjax._numerics import _compile, _whole_loops
 from nsjax._numerics._compile import interactive, MANY
-from nsjax._numerics._whole_loops import whole_loops
+from nsjax._numerics._whole_loops import ask_for_whole_loops, on_request, whole_loops
+from nsjax.sweeps._lanes import WORTH
 
 
 def climb(x):
@@ -99,3 +105,69 @@ def test_they_are_asked_for_by_what_is_called_directly():
     jax.jit(fn)(jnp.ones(6)), jax.vmap(fn)(jnp.ones((MANY + 1, 7))), interactive(fn, often=True)(jnp.ones(8))
     assert not any(seen[:2]) and not seen[-1] and len(seen) >= 3
     assert not _whole_loops._here.wanted
+
+
+@tried
+def test_they_can_be_asked_for_while_tracing():
+    def asking(x):
+        ask_for_whole_loops()
+        return climb(x)
+
+    with on_request() as request:
+        lowered = jax.jit(asking).lower(X)
+    assert request.made
+    assert not is_whole(asking, X)  # only there
+    found = []  # elsewhere, as the threads of a sweep on several devices do
+
+    def elsewhere():
+        with on_request(request):
+            found.append(lowered.compile().as_text())
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start(), thread.join()
+    assert "xla_cpu_small_call" in found[0]
+    with on_request():
+        assert not is_whole(climb, X)
+
+
+def slides(t1, solver=diffrax.Tsit5(), system=gallery.StickSlip()):
+    return nsjax.solve(system, 0.0, t1, gallery.Motion(2.5, -0.5), solver=solver, throw=False).y1.x
+
+
+class Twice(gallery.StickSlip):
+    """With one more surface."""
+
+    @nsjax.sgn
+    def second(self, t, y):
+        return y.x + 10.0
+
+
+@pytest.mark.parametrize(
+    "options, asks",
+    [
+        ({}, True),
+        ({"solver": diffrax.Dopri8()}, True),
+        ({"solver": nsjax.Taylor()}, False),
+        ({"system": Twice()}, False),
+    ],
+)
+def test_what_asks_for_them(options, asks):
+    """Runge-Kutta with one switch; also if it was traced before."""
+    for _ in range(2):
+        with on_request() as request:
+            jax.make_jaxpr(lambda t1: slides(t1, **options))(1.0)
+        assert request.made == asks
+
+
+@pytest.mark.parametrize("number", [WORTH - 1, WORTH])
+@pytest.mark.parametrize("options", [{}, {"devices": 1}])
+def test_sweeps_of_many_lanes_let_them_ask(number, options):
+    seen = []
+
+    def lane(x):
+        seen.append(_whole_loops._here.request is not None)
+        return 2 * x
+
+    nsjax.sweep(lane, jnp.ones(number), **options)
+    assert seen and set(seen) == {number == WORTH}
+    assert _whole_loops._here.request is None
