@@ -110,8 +110,10 @@ def _install() -> None:
 
     def get_compile_options(*args: Any, **kwargs: Any) -> Any:
         options = given(*args, **kwargs)
-        flags, asked = os.environ.get("XLA_FLAGS", ""), _here.request is not None and _here.request.made
-        if _here.wanted or (asked and NAME not in flags and _all_known()):
+        flags = os.environ.get("XLA_FLAGS", "")
+        made = _here.request is not None and _here.request.made
+        asked = made and NAME not in flags and _all_known()
+        if _here.wanted or asked:
             with contextlib.suppress(Exception):  # those of another version
                 options = CompileOptions.ParseFromString(options.SerializeAsString() + _ADDED)
                 if asked:

@@ -52,14 +52,6 @@ class _Options(NamedTuple):
     still: bool = False  # whether only the state at the end has derivatives
 
 
-def _called(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> Solution:
-    """`_run`, which may have been traced before, so that what goes with it in a sweep is asked for here."""
-    series = isinstance(options.integrator.solver, Taylor | AbstractExponential)
-    if len(system.switches) <= 1 and not series:  # of more switches it takes 1.4 times as long to compile
-        ask_for_whole_loops()
-    return _run(system, t0, t1, y0, options)
-
-
 @interactive
 def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> Solution:
     def run(system: System, t0: Scalar, t1: Scalar, y0: Y) -> Solution:
@@ -384,7 +376,9 @@ def solve(
         dt0 = jnp.abs(jnp.asarray(dt0, t0.dtype))
     concrete = throw and known((system, t0, t1, y0, given, integrator, saveat, dt0))
     within = throw and not concrete  # raised by the compiled program itself
-    sol = _called(system, t0, t1, y0, _Options(given, integrator, saveat, dt0, within, progress_meter))
+    if len(system.switches) <= 1 and not isinstance(integrator.solver, Taylor | AbstractExponential):
+        ask_for_whole_loops()  # (of more switches that takes 1.4 times as long to compile)
+    sol = _run(system, t0, t1, y0, _Options(given, integrator, saveat, dt0, within, progress_meter))
     if not concrete:
         return sol
     if not known(sol.result):  # numbers that are known, within a function that is being compiled
@@ -408,4 +402,4 @@ def integrate(
     """`solve` for arguments that have been checked, which never raises. `still`: only `y1` has derivatives, not what is
     saved or logged on the way, which makes a smaller program."""
     options = _Options(given_modes(system, mode), integrator.with_arrays(t0.dtype), saveat, still=still)
-    return _called(arrays_of(system, t0.dtype), t0, jnp.asarray(t1, t0.dtype), y0, options)
+    return _run(arrays_of(system, t0.dtype), t0, jnp.asarray(t1, t0.dtype), y0, options)
