@@ -11,8 +11,8 @@ import numpy as np
 # Small enough for the working set of a step to stay in the cache and for lanes to wait for few others, large enough to
 # fill the vector units and hide what every step costs once: `benchmarks/growth.py` measures it.
 CHUNK = 256
-# From so many lanes on a program may take longer to compile that runs in two thirds of the time (with impacts by
-# Runge-Kutta a quarter longer, with friction alone as long as otherwise).
+# From so many lanes on a program may take longer to compile that runs in two thirds of the time (with impacts a
+# quarter longer, with friction alone about as long).
 WORTH = 4096
 
 

@@ -17,6 +17,7 @@ from trajectory import share, told_but_ambiguous
 
 import nsjax
 from nsjax import Affine, Exponential, gallery, RESULTS, solve
+from nsjax.flow.affine import _exact
 
 
 SHAPES = {
@@ -242,6 +243,15 @@ def test_float32():
     sol = slider(v, Motion(jnp.float32(2.5), jnp.float32(-0.5)), jnp.float32(20))
     assert sol.y1.x.dtype == jnp.float32
     np.testing.assert_allclose(flat(sol.y1), reference.stick_slip_final(np.array([0.5]), 20.0)[0], atol=2e-5)
+
+
+@pytest.mark.slow
+def test_many_lanes_together(monkeypatch):
+    """As on other devices than a CPU: the number of lanes that go together is no matter for what comes out."""
+    v = np.linspace(0.2, 0.9, 300)
+    monkeypatch.setattr(_exact, "_IN_CACHE", _exact._IN_MEMORY)
+    many = jax.jit(jax.vmap(lambda v: jnp.stack(slider(v, t1=20.0).y1)))(v)
+    np.testing.assert_allclose(many, reference.stick_slip_final(v, 20.0), atol=1e-12)
 
 
 @pytest.mark.slow

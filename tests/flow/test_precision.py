@@ -72,8 +72,8 @@ def test_forced_for_long_in_single_precision(solver):
     sol = solve(single(model), 0.0, 100.0, single(y0), solver=solver)
     assert sol.y1.x.dtype == jnp.float32 and len(exact.events) > 5
     assert itinerary(sol) == itinerary(exact)
-    np.testing.assert_allclose(times(sol), times(exact), atol=1e-3)
-    np.testing.assert_allclose(flat(sol.y1), flat(exact.y1), atol=1e-3)
+    np.testing.assert_allclose(times(sol), times(exact), atol=1e-4)
+    np.testing.assert_allclose(flat(sol.y1), flat(exact.y1), atol=1e-4)
 
 
 def test_jax_as_it_comes():
