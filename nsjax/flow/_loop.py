@@ -116,6 +116,8 @@ class Flow(eqx.Module):
         if model.clocks:
             t_next = jnp.minimum(t_next, jnp.maximum(tick, c.t))
         step = stepper(model, c.state, c.t, t_next, c.y, c.f, Watch(self.affine, self.controller))
+        if self.seen:  # of many guards, each of which several kernels would compute anew
+            step = step._replace(guards=once(step.guards))
         t_next = step.t_next
         keep, dt, controller, outcome = self.pace(c, step)
         halvings, result, touches = c.halvings, promoted(outcome), []
