@@ -242,7 +242,7 @@ def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar
     return found, jnp.where(found, root, one)
 
 
-FEW = 8  # polynomials looked at together, of many
+FEW = 4  # polynomials looked at together, of many
 DENSE = 24  # up to so many all are looked at: two for each guard, see `locate`
 
 
@@ -255,15 +255,15 @@ def first_roots(
     if count <= DENSE:
         return jax.vmap(first_root)(a)
     busy = ~no_root(a) & wanted()
-    rank = jnp.cumsum(busy.astype(jnp.int32))
+    order = -jnp.arange(count, dtype=jnp.float32)
 
     def look(carry: tuple) -> tuple:
-        begin, found, root = carry
-        ranks = begin + 1 + jnp.arange(FEW, dtype=jnp.int32)
-        place = jnp.searchsorted(rank, ranks, method="compare_all")  # past the last one: dropped
+        left, found, root = carry
+        key, place = jax.lax.top_k(jnp.where(left, order, -jnp.inf), FEW)  # the first ones that are left
         new = jax.vmap(first_root)([x.at[place].get(mode="clip") for x in a])
-        found, root = (x.at[place].set(y, mode="drop") for x, y in zip((found, root), new))
-        return begin + FEW, found, root
+        place = jnp.where(key > -jnp.inf, place, count)  # what is none of them is dropped
+        left, found, root = (x.at[place].set(y, mode="drop") for x, y in zip(carry, (False, *new)))
+        return left, found, root
 
-    start = (jnp.zeros((), jnp.int32), jnp.zeros(count, bool), jnp.ones(count, a[0].dtype))
-    return jax.lax.while_loop(lambda carry: carry[0] < rank[-1], look, start)[1:]
+    start = (busy, jnp.zeros(count, bool), jnp.ones(count, a[0].dtype))
+    return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), look, start)[1:]
