@@ -22,6 +22,7 @@ import numpy as np
 from ._graph import Graph, Handlers, Node, Packing, Value
 from ._inner import scan_counts
 from ._lane_cond import compact_cond
+from ._places import at_places
 from ._rolled import bound
 
 
@@ -242,8 +243,7 @@ def _side_by_side(members: tuple[Value, ...]) -> _Step:
     different = {id(v): v for v in members}
     if len(different) < count:
         places = {key: i for i, key in enumerate(different)}
-        index = np.array([places[id(v)] for v in members])
-        return _Step([tuple(different.values())], lambda x: x[index])
+        return _Step([tuple(different.values())], at_places(np.array([places[id(v)] for v in members])))
     if all(isinstance(v.const, bool | int | float | np.generic | np.ndarray) for v in members):
         row = np.array([v.const for v in members]).astype(first.dtype)
         return _Step([], lambda: jnp.asarray(row))
@@ -252,8 +252,8 @@ def _side_by_side(members: tuple[Value, ...]) -> _Step:
         bases = {id(v.base): v.base for v in members if v.base is not None}
         if first.base is not None:
             places, size = {key: i for i, key in enumerate(bases)}, first.base.size
-            picked = _picked([places[id(v.base)] * size + v.index for v in members], len(bases) * size)
-            return _Step([first.base if len(bases) == 1 else tuple(bases.values())], picked)
+            put = at_places(np.array([places[id(v.base)] * size + v.index for v in members]))
+            return _Step([first.base if len(bases) == 1 else tuple(bases.values())], lambda x: put(jnp.ravel(x)))
         if first.elementwise:
             operands = zip(*(v.node.ins for v in members if v.node is not None))
             return _Step([tuple(each) for each in operands], _on_rows(first))
@@ -262,11 +262,11 @@ def _side_by_side(members: tuple[Value, ...]) -> _Step:
         return _Step(list(members), lambda *xs: jnp.stack(xs))
     needs = [tuple(members[i] for i in group) for group in found.groups] + [members[i] for i in found.rest]
     order = np.argsort([*(i for group in found.groups for i in group), *found.rest])
-    arrays = len(found.groups)
+    arrays, put = len(found.groups), at_places(order)
 
     def joined(*xs: Any) -> Any:
         parts = [*xs[:arrays], *([jnp.stack(xs[arrays:])] if len(xs) > arrays else [])]
-        return jnp.concatenate(parts)[order]
+        return put(jnp.concatenate(parts))
 
     return _Step(needs, joined)
 
@@ -289,18 +289,6 @@ def _on_rows(v: Value) -> Callable[..., Any]:
         return node.bind(*map(spread, xs))[0]
 
     return work
-
-
-def _picked(places: list[int], size: int) -> Callable[[Any], Any]:
-    """These entries of an array, by a slice if they lie evenly."""
-    index, n = np.array(places), len(places)
-    steps = np.diff(index)
-    if n == size and np.array_equal(index, np.arange(n)):
-        return jnp.ravel
-    if n > 1 and steps[0] > 0 and np.all(steps == steps[0]):
-        low, high, step = int(index[0]), int(index[-1]) + 1, int(steps[0])
-        return lambda x: lax.slice(jnp.ravel(x), (low,), (high,), (step,))
-    return lambda x: jnp.ravel(x)[index]
 
 
 def _worked_out(graph: Graph, results: list[Value], xs: list[Any]) -> list[Any]:
