@@ -159,10 +159,23 @@ def _of_rolled(graph: Graph, e: Any, ins: list[Value]) -> list[Value]:
     return node.outs
 
 
+def _of_select(graph: Graph, e: Any, ins: list[Value]) -> list[Value]:
+    """Equinox's choice between the carries of a loop, by one predicate for many of them."""
+    predicate = ins[0]
+    while predicate.node is not None and predicate.node.name == "copy":
+        predicate = predicate.node.ins[0]
+    ins = [predicate, *ins[1:]]
+    node = graph.add(ins, e, [v.aval for v in e.outvars], e.params)
+    node.kind, bind = (node.kind, id(predicate)), node.bind
+    node.bind = lambda pred, *xs: bind(pred[0] if pred.ndim else pred, *xs)
+    return node.outs
+
+
 _HANDLERS: Handlers = {
     "compact_cond": _of_compact_cond,
     "rolled": _of_rolled,
     "scan": _of_scan,
+    "select_if_vmap": _of_select,
     "while": _of_while,
 }
 

@@ -1,5 +1,6 @@
 """Operations on many numbers as one on an array: the same results, and programs that hardly grow."""
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,8 +51,22 @@ def looped(n):
     return fn
 
 
+def ended(n):
+    """Equinox's loop, which chooses between two carries at the end of each turn."""
+
+    def fn(x):
+        def body(c):
+            i, ys = c
+            return i + 1, [jnp.cos(y) for y in ys]
+
+        start = (0, [jnp.sin(k + x[0]) for k in range(n)])
+        return eqxi.while_loop(lambda c: eqxi.unvmap_any(c[0] < 4), body, start, kind="lax")[1]
+
+    return fn
+
+
 @pytest.mark.parametrize("n", [3, 8])
-@pytest.mark.parametrize("make", [oscillators, looped])
+@pytest.mark.parametrize("make", [oscillators, looped, ended])
 def test_results_and_derivatives_are_the_same(make, n):
     fn = make(n)
     args = [jnp.asarray(np.random.default_rng(0).normal(size=(5, n))) for _ in range(2 if make is oscillators else 1)]
@@ -63,7 +78,7 @@ def test_results_and_derivatives_are_the_same(make, n):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13), got, jax.vmap(fn)(*args))
 
 
-@pytest.mark.parametrize("make", [oscillators, looped])
+@pytest.mark.parametrize("make", [oscillators, looped, ended])
 def test_programs_do_not_grow(make):
     def size(n):
         xs = [jnp.ones(n)] * (2 if make is oscillators else 1)
