@@ -92,9 +92,9 @@ def main() -> None:
     rows = []
     print(HEAD)
     for derivative, transform in DERIVATIVES.items():
-        for model, lane in MODELS.items():
-            fn = transform(lane)
-            program = measure(lambda y0, fn=fn: nsjax.sweep(fn, y0), starts, repeats=args.repeats)
+        lanes = [transform(lane) for lane in MODELS.values()]
+        programs = measure([(lambda y0, fn=fn: nsjax.sweep(fn, y0), (starts,)) for fn in lanes], args.repeats)
+        for model, fn, program in zip(MODELS, lanes, programs):
             _, (okay, steps, events) = program.out
             if not np.all(okay):
                 raise RuntimeError(f"Lanes failed: {model}, {derivative}.")
