@@ -7,7 +7,6 @@ that each root is isolated or excluded.
 
 import functools as ft
 import math
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -246,15 +245,12 @@ FEW = 4  # polynomials looked at together, of many
 DENSE = 24  # up to so many all are looked at: two for each guard, see `locate`
 
 
-def first_roots(
-    a: list[Float[Array, "polynomials parts"]], wanted: Callable[[], Bool[Array, " polynomials"]]
-) -> tuple[Bool[Array, " polynomials"], Array]:
-    """`first_root` of each of them. Of many, most are positive all along, and only the others are looked at, as far as
-    they are wanted."""
+def first_roots(a: list[Float[Array, "polynomials parts"]]) -> tuple[Bool[Array, " polynomials"], Array]:
+    """`first_root` of each of them. Of many, most are positive all along, and only the others are looked at."""
     count = len(a[0])
     if count <= DENSE:
         return jax.vmap(first_root)(a)
-    busy = ~no_root(a) & wanted()
+    busy = ~no_root(a)
     order = -jnp.arange(count, dtype=jnp.float32)
 
     def look(carry: tuple) -> tuple:
