@@ -31,6 +31,15 @@ def same(found, want):
         assert a.dtype == b.dtype and np.asarray(a).tobytes() == np.asarray(b).tobytes()
 
 
+def close(found, want):
+    """But for rounding: the same lanes by two programs, which XLA need not compile alike."""
+    assert jax.tree.structure(found) == jax.tree.structure(want)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(want)):
+        assert a.dtype == b.dtype
+        exact = a.dtype.kind != "f"
+        np.testing.assert_allclose(a, b, rtol=0 if exact else 1e-12, atol=0 if exact else 1e-13)
+
+
 @pytest.fixture(scope="module")
 def want():
     return sweep(iterated, X, 1.5, chunk=64)
@@ -59,7 +68,7 @@ def test_solutions(tmp_path):
 
     runs = Sweep(few, system, 2.5, path=tmp_path, block=4, chunk=4).run()
     sol = runs.result()
-    same(sol, sweep(few, system, 2.5, chunk=4))
+    close(sol, sweep(few, system, 2.5, chunk=4))
     assert isinstance(sol, nsjax.Solution) and isinstance(sol.y1.x, np.memmap) and sol.y1.x.shape == (10,)
     assert sol.events.names == ("belt",) and "10 solutions of StickSlip" in str(sol)
     failed = np.flatnonzero(~np.asarray(nsjax.is_okay(sol.result)))
