@@ -167,7 +167,7 @@ def _of_select(graph: Graph, e: Any, ins: list[Value]) -> list[Value]:
     ins = [predicate, *ins[1:]]
     node = graph.add(ins, e, [v.aval for v in e.outvars], e.params)
     node.kind, bind = (node.kind, id(predicate)), node.bind
-    node.bind = lambda pred, *xs: bind(pred[0] if pred.ndim else pred, *xs)
+    node.bind = lambda pred, *xs: bind(pred[0] if pred.ndim else pred, *xs)  # one and the same in all rows
     return node.outs
 
 

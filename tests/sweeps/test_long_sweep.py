@@ -37,7 +37,7 @@ def close(found, want):
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(want)):
         assert a.dtype == b.dtype
         exact = a.dtype.kind != "f"
-        np.testing.assert_allclose(a, b, rtol=0 if exact else 1e-12, atol=0 if exact else 1e-13)
+        np.testing.assert_allclose(a, b, rtol=0 if exact else 1e-14, atol=0 if exact else 1e-14)
 
 
 @pytest.fixture(scope="module")
