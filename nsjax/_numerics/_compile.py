@@ -56,7 +56,7 @@ QUICK = {**OFTEN, "xla_backend_optimization_level": 0, "xla_cpu_experimental_ynn
 
 
 @ft.cache
-def _options(often: bool) -> dict[str, Any]:
+def options(often: bool = False) -> dict[str, Any]:
     """Those that this version of XLA knows; on other devices than a CPU none of them are of use."""
     if jax.default_backend() != "cpu":
         return {}
@@ -103,18 +103,18 @@ def long_running(fn: F) -> F:
     return cast(F, call)
 
 
-def interactive(fn: F, often: bool = False, host: bool = False) -> F:
+def interactive(fn: F, host: bool = False) -> F:
     """`equinox.filter_jit` for what a user calls and waits for: compiled quickly, where it is not part of another
-    program; less so if it is called `often` and is more than one solution. With `host` it returns NumPy's arrays, as
-    every operation that Python applies to one of JAX's is compiled as a program of its own."""
+    program. With `host` it returns NumPy's arrays, as every operation that Python applies to one of JAX's is compiled
+    as a program of its own."""
     jit: Any = eqx.filter_jit
     within = jit(fn)
 
     @ft.cache  # not on import: which options there are is found out by compiling
     def alone() -> Any:
-        return jit(fn, compiler_options=_options(often))
+        return jit(fn, compiler_options=options())
 
-    kept = Programs(fn, lambda: _options(often))
+    kept = Programs(fn, options)
 
     @full_products
     @ft.wraps(fn)
@@ -122,7 +122,7 @@ def interactive(fn: F, often: bool = False, host: bool = False) -> F:
         # The options can only be given to the outermost program.
         mine = outermost()
         run = kept if eager() and is_kept() else alone() if mine else within
-        with without_collection(), whole_loops(mine and not often):
+        with without_collection(), whole_loops(mine):
             found = run(*args, **kwargs)
         return on_host(found) if host else found
 

@@ -91,7 +91,7 @@ class _Array:
 _ARRAY = _Array()
 
 
-def _split(tree: Any) -> tuple[list[Any], tuple[Any, ...], Any]:
+def split(tree: Any) -> tuple[list[Any], tuple[Any, ...], Any]:
     """The arrays of a tree, its other leaves with placeholders for these, and its structure."""
     leaves, structure = jax.tree.flatten(tree)
     arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
@@ -104,14 +104,20 @@ def _joined(arrays: Any, others: tuple[Any, ...], structure: Any) -> Any:
 
 
 class _Program:
-    """Compiled code, and of what it returns all that is no array."""
+    """Compiled code, and of what it returns all that is no array. `again` compiles it, if it was read from a file."""
 
-    def __init__(self, compiled: Any, others: tuple[Any, ...], structure: Any, fresh: bool) -> None:
-        self.compiled, self.others, self.structure, self.fresh = compiled, others, structure, fresh
+    def __init__(self, compiled: Any, others: tuple[Any, ...], structure: Any, again: Any = None) -> None:
+        self.compiled, self.others, self.structure, self._again = compiled, others, structure, again
 
     def __call__(self, arrays: list[Any]) -> Any:
-        found = self.compiled(arrays)[:-1]
-        self.fresh = True  # it works
+        try:
+            found = self.compiled(arrays)[:-1]
+        except jax.errors.JaxRuntimeError:
+            if self._again is None:
+                raise
+            self.compiled = self._again().compiled  # this machine cannot use the file
+            found = self.compiled(arrays)[:-1]
+        self._again = None  # it works
         return _joined(found, self.others, self.structure)
 
 
@@ -127,38 +133,39 @@ class Programs:
     def __init__(self, fn: Callable[..., Any], options: Callable[[], dict[str, Any]]) -> None:
         self._fn, self._options = fn, options
         # With those of JAX: `jax.clear_caches()` forgets them too.
-        self._known = cache(max_size=None, trace_context_in_key=False)(dict)
+        self.known = dict if trace_context is None else cache(max_size=None, trace_context_in_key=False)(dict)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        arrays, others, structure = _split((args, kwargs))
+        return self.ready(*args, **kwargs)(split((args, kwargs))[0])
+
+    def ready(self, *args: Any, **kwargs: Any) -> "_Program":
+        """The program for such arguments, which is called with their arrays."""
+        arrays, others, structure = split((args, kwargs))
         kinds = tuple(jax.typeof(array) for array in arrays)
         signature = (structure, others, tuple(map(type, others)), kinds, trace_context())
-        known = self._known()
+        known = self.known()
         program = known.get(signature)
         if program is None:
             program = known[signature] = self._made((args, kwargs), arrays, others, structure)
-        if program.fresh:
-            return program(arrays)
-        try:
-            return program(arrays)
-        except jax.errors.JaxRuntimeError:  # a file that this machine cannot use
-            program = known[signature] = self._compiled(arrays, others, structure)
-            return program(arrays)
+        return program
 
     def _made(self, given: Any, arrays: list[Any], others: tuple[Any, ...], structure: Any) -> _Program:
-        """Read from the folder; or compiled, and written there."""
+        """Read from the folder, if there is one; or compiled, and written there."""
+        again = ft.partial(self._compiled, arrays, others, structure)
+        if not is_kept():
+            return again()
+        assert _Place.folder is not None
         fingerprint = Fingerprint()
         try:
             fingerprint.constant((_surroundings(), _settings(), self._options()))
             fingerprint.constant(self._fn)
             fingerprint.traced(given)
         except (UnknownError, RecursionError):
-            return self._compiled(arrays, others, structure)
-        assert _Place.folder is not None
+            return again()
         file = _Place.folder / f"{fingerprint.digest}.program"
-        program = _read(file, arrays, fingerprint)
+        program = _read(file, arrays, fingerprint, again)
         if program is None:
-            program = self._compiled(arrays, others, structure)
+            program = again()
             _write(file, program, fingerprint)
         return program
 
@@ -167,16 +174,16 @@ class Programs:
 
         def kept_by_nsjax(arrays: list[Any]) -> list[Any]:
             args, kwargs = _joined(arrays, others, structure)
-            found, *rest = _split(self._fn(*args, **kwargs))
+            found, *rest = split(self._fn(*args, **kwargs))
             returned[:] = rest
             # With this besides, as `equinox.filter_jit` has it by chance, XLA's executor hands fewer tasks to other
             # threads: sweeps take half of the processor's time, and two thirds of the clock's.
             return [*found, jnp.zeros((), jnp.int32)]
 
         lowered = jax.jit(kept_by_nsjax).lower(arrays)
-        with _not_kept_by_jax():
+        with _not_kept_by_jax() if is_kept() else contextlib.nullcontext():
             compiled = lowered.compile(self._options() or None)
-        return _Program(compiled, *returned, fresh=True)
+        return _Program(compiled, *returned)
 
 
 @contextlib.contextmanager
@@ -249,19 +256,21 @@ def _write(file: pathlib.Path, program: _Program, fingerprint: Fingerprint) -> N
         part.replace(file)
 
 
-def _read(file: pathlib.Path, arrays: list[Any], fingerprint: Fingerprint) -> _Program | None:
+def _read(
+    file: pathlib.Path, arrays: list[Any], fingerprint: Fingerprint, again: Callable[[], _Program]
+) -> _Program | None:
     """Nothing if there is none, or if it cannot be used."""
     try:
         skeleton, count, code = pickle.loads(zlib.decompress(file.read_bytes()))
         tree = _Reader(io.BytesIO(skeleton), fingerprint).load()
-        _, others, structure = _split(tree)
+        _, others, structure = split(tree)
         wanted = jax.tree.structure(((arrays,), {})), jax.tree.structure([0] * count)
         _give_lapack()
         compiled = serialize_executable.deserialize_and_load(code, *wanted)
         os.utime(file)
     except Exception:  # of every kind, by what is wrong with it
         return None
-    return _Program(compiled, others, structure, fresh=False)
+    return _Program(compiled, others, structure, again)
 
 
 @ft.cache

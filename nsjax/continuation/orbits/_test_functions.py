@@ -3,10 +3,12 @@
 Each is written once, in the namespace of its arrays: NumPy's for a point that is looked at, jax's within a program.
 """
 
+import functools as ft
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..._numerics._repeated import Same
 from ...derivatives._floquet import trivial
 from ...orbits.segments._equations import OrbitCurve
 from ...orbits.segments._itinerary import EVENT, GRAZING, OrbitItinerary, REPELLING_EXIT
@@ -36,10 +38,11 @@ def complex_pair(multipliers: np.ndarray) -> bool:
     return bool(np.any(on & (np.abs(np.imag(multipliers)) > 1e-6)))
 
 
-def corner_tests(rows: int, slots: int) -> list[Test]:
+@ft.lru_cache(maxsize=64)
+def corner_tests(rows: int, slots: int) -> tuple[Test, ...]:
     """By the numbers of segments and guards, in the order of `corner_values`."""
-    of_segments = [Test(kind, i) for kind in ("rate", "margin", "duration") for i in range(rows)]
-    return of_segments + [Test("guard", i, j) for i in range(rows) for j in range(slots)]
+    of_segments = (Test(kind, i) for kind in ("rate", "margin", "duration") for i in range(rows))
+    return (*of_segments, *(Test("guard", i, j) for i in range(rows) for j in range(slots)))
 
 
 def corner_values(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary) -> tuple[Any, Any]:
@@ -71,7 +74,7 @@ def circle_values(multipliers: Any, autonomous: bool) -> Any:
     xp = multipliers.__array_namespace__()
     counts = xp.isfinite(multipliers) & ~(trivial(multipliers) & autonomous)
     rho = xp.where(counts, multipliers, 0)
-    first, second = xp.triu_indices(len(rho), 1)
+    first, second = np.triu_indices(len(rho), 1)
     flip = (1 + rho) / (1 + xp.abs(rho)).astype(rho.dtype)
     off = xp.where(counts[first] & counts[second], rho[first] * rho[second] - 1, 1)
     pairs = off / (1 + xp.abs(off)).astype(rho.dtype)
@@ -80,16 +83,21 @@ def circle_values(multipliers: Any, autonomous: bool) -> Any:
 
 def test_values(curve: OrbitCurve, spot: Any, log: float) -> dict[Test, float]:
     """All test functions of a point; the determinant is divided by exp(log)."""
-    share = float(spot.look.u[-1])
-    ends = {Test("low"): share, Test("high"): 1 - share}
-    smooth = {Test("fold"): float(spot.look.tangent[-1]), BRANCH: float(branch_value(spot.look, log))}
-    return ends | of_corners(curve, spot) | smooth | of_circle(curve, spot)
+    return {**_undivided(Same(curve), Same(spot)), BRANCH: float(branch_value(spot.look, log))}
+
+
+@ft.lru_cache(maxsize=16)  # each point is looked at as the end of a step and as the beginning of the next
+def _undivided(curve: Same, spot: Same) -> dict[Test, float]:
+    look = spot.it.look
+    share = float(look.u[-1])
+    ends = {Test("low"): share, Test("high"): 1 - share, Test("fold"): float(look.tangent[-1])}
+    return ends | of_corners(curve.it, spot.it) | of_circle(curve.it, spot.it)
 
 
 def of_corners(curve: OrbitCurve, spot: Any) -> dict[Test, float]:
     values, there = corner_values(curve, spot.look, spot.itinerary)
     names = corner_tests(*spot.look.least.shape)
-    return {names[i]: float(values[i]) for i in np.flatnonzero(there)}
+    return {name: value for name, value, known in zip(names, values.tolist(), there.tolist()) if known}
 
 
 def of_circle(curve: OrbitCurve, spot: Any) -> dict[Test, float]:

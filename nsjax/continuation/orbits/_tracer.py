@@ -56,6 +56,11 @@ class OrbitPoint:
         return dataclasses.replace(self, look=look._replace(tangent=-look.tangent, branch=branch))
 
 
+def begins_on(test: Test, before: float, after: float) -> bool:
+    """Whether a step sets out on a corner."""
+    return test.kind in CORNERS and abs(before) < ON < -after
+
+
 def spot_of(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary) -> OrbitPoint:
     look = on_host(look)
     return OrbitPoint(look, itinerary, look.multipliers, bool(look.stable), look.monodromy)
@@ -156,20 +161,26 @@ class OrbitTracer(AbstractTracer[OrbitPoint]):
         found."""
         before, after = (test_values(self.curve, p, scale) for p in (spot, step))
         found, lost, seen = [], [], {0.0: spot, length: step}
-        for test, value in sorted(before.items(), key=lambda item: RANK.get(item[0].kind, 99)):
-            if test not in after or after[test] == 0:
-                continue
-            if test.kind in CORNERS and abs(value) < ON < -after[test] and not self.virtual:
+        changing = [t for t, v in before.items() if t in after and self.changes(t, v, after[t])]
+        for test in sorted(changing, key=lambda test: RANK.get(test.kind, 99)):
+            if begins_on(test, before[test], after[test]):
                 found.append(Zero(0.0, test, spot))
                 continue
-            if value * after[test] > 0 or (self.virtual and test.kind not in ("low", "high")):
-                continue
-            if test.kind in (*CORNERS, "low", "high") and after[test] > 0:
-                continue  # it comes from where it could not be: a start on the point itself
             zero = self.shared(seen, found, test, scale) or self.locate(seen, test, scale)
             found += [] if zero is None else [zero]
             lost += [test] if zero is None else []
         return found, lost
+
+    def changes(self, test: Test, before: float, after: float) -> bool:
+        """Whether a test function has a zero between two values that is to be looked for."""
+        if after == 0 or (self.virtual and test.kind not in ("low", "high")):
+            return False
+        if begins_on(test, before, after):
+            return True
+        if before * after > 0:  # (one that is not a number may have changed its sign)
+            return False
+        # What rises at a corner comes from where it could not be: a start on the point itself.
+        return not (test.kind in (*CORNERS, "low", "high") and after > 0)
 
     def shared(self, seen: dict[float, OrbitPoint], found: list[Zero], test: Test, scale: float) -> Zero | None:
         """The zero of another test function, if this one too changes its sign where zeros are one: at a corner ten of

@@ -1,6 +1,7 @@
 """What is seen of a point of a curve of orbits: its direction, its multipliers, what its guards do along the way."""
 
 import functools as ft
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from ..._numerics._compile import interactive
+from ..._numerics._repeated import Repeated, Same
 from ..._numerics._root import Newton
 from ..._types import Scalar
 from ...derivatives._floquet import floquet, structural_zeros
@@ -92,12 +93,18 @@ def correct(
     default straight ahead), and all that is seen of it; or, without `newton`, of the guess itself."""
     plane = plane.filled()
     guess = plane.origin + np.dot(plane.distance, plane.normal) if guess is None else guess
-    curve, looks = curve.on(itinerary), np.asarray(newton)
-    found, spoilt = _correct(curve, itinerary, plane, guess, looks)
-    return _correct(curve.fixed, itinerary, plane, guess, looks)[0] if spoilt else found
+    which, rest = (Same(curve), Same(itinerary)), (plane, guess, np.asarray(newton))
+    found, spoilt = _at(*which)(*rest)
+    return _at(*which, fixed=True)(*rest)[0] if spoilt else found
 
 
-@ft.partial(interactive, often=True)
+@ft.lru_cache(maxsize=16)  # for branches that are followed in turn
+def _at(curve: Same, itinerary: Same, fixed: bool = False) -> Callable[..., Any]:
+    given = curve.it.on(itinerary.it)
+    return _correct.at(given.fixed if fixed else given, itinerary.it)
+
+
+@Repeated
 def _correct(
     curve: OrbitCurve, itinerary: OrbitItinerary, plane: Plane, guess: Array, newton: Array
 ) -> tuple[PointData, Bool[Array, ""]]:

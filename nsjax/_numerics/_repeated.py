@@ -1,0 +1,91 @@
+"""Programs that are called for one point after the other.
+
+A step along a branch takes a millisecond, and to hand a model to its program and its thirty results back takes as long
+again. So what is the same at every point is given once, and the results come as one array of each kind.
+"""
+
+import functools as ft
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ._compile import interactive, on_host, options, without_collection
+from ._products import full_products
+from ._programs import Programs, split, trace_context
+
+
+class Same:
+    """A thing as a key: itself, and nothing that is equal to it."""
+
+    def __init__(self, it: Any) -> None:
+        self.it = it
+
+    def __hash__(self) -> int:
+        return id(self.it)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Same) and other.it is self.it
+
+
+class Repeated:
+    """A function of pytrees that Python calls often, and not within other programs; it returns NumPy's arrays.
+
+    **Arguments:**
+
+    - `fn`: the function. All that it returns are arrays.
+    """
+
+    def __init__(self, fn: Callable[..., Any]) -> None:
+        self.programs = Programs(ft.partial(_joined, fn), ft.partial(options, often=True))
+        self.plain = interactive(fn, host=True)
+
+    def at(self, *given: Any) -> Callable[..., Any]:
+        """With its first arguments given: a function of the others, which are arrays, or tuples of them."""
+        return _At(self, given)
+
+
+class _At:
+    def __init__(self, repeated: Repeated, given: Any) -> None:
+        self._repeated, self._given = repeated, given
+        self._arrays = jax.device_put(split(given)[0])
+        self._known: Any = None
+        self._ready: dict[Any, Callable[..., Any]] = {}
+
+    @full_products
+    def __call__(self, *args: Any) -> Any:
+        programs, arrays = self._repeated.programs, jax.tree.leaves(args)
+        if trace_context is None or jax.config.values["jax_disable_jit"]:
+            return self._repeated.plain(*self._given, *args)
+        known = programs.known()
+        if known is not self._known:  # `jax.clear_caches()` was called
+            self._known, self._ready = known, {}
+        kind = (trace_context(), *((x.shape, x.dtype) for x in arrays))
+        if kind not in self._ready:
+            with without_collection():
+                self._ready[kind] = programs.ready(*self._given, *args)
+        return _apart(*self._ready[kind]([*self._arrays, *arrays]))
+
+
+def _joined(fn: Callable[..., Any], *args: Any) -> tuple[list[Any], Any]:
+    """The arrays that a function returns as one of each kind, and their forms."""
+    tree = fn(*args)
+    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    kinds = list(dict.fromkeys(leaf.dtype for leaf in leaves))
+    vectors = [jnp.concatenate([jnp.ravel(x) for x in leaves if x.dtype == kind]) for kind in kinds]
+    return vectors, jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.asarray(x).dtype), tree)
+
+
+def _apart(vectors: list[Any], forms: Any) -> Any:
+    """Views of them."""
+    places = {vector.dtype: [vector, 0] for vector in on_host(vectors)}
+
+    def view(form: Any) -> np.ndarray:
+        place = places[form.dtype]
+        vector, start = place
+        place[1] = stop = start + form.size
+        return vector[start:stop].reshape(form.shape)
+
+    return jax.tree.map(view, forms)
