@@ -133,7 +133,7 @@ class Programs:
     def __init__(self, fn: Callable[..., Any], options: Callable[[], dict[str, Any]]) -> None:
         self._fn, self._options = fn, options
         # With those of JAX: `jax.clear_caches()` forgets them too.
-        self.known = dict if trace_context is None else cache(max_size=None, trace_context_in_key=False)(dict)
+        self._known = dict if trace_context is None else cache(max_size=None, trace_context_in_key=False)(dict)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         return self.ready(*args, **kwargs)(split((args, kwargs))[0])
@@ -143,7 +143,7 @@ class Programs:
         arrays, others, structure = split((args, kwargs))
         kinds = tuple(jax.typeof(array) for array in arrays)
         signature = (structure, others, tuple(map(type, others)), kinds, trace_context())
-        known = self.known()
+        known = self._known()
         program = known.get(signature)
         if program is None:
             program = known[signature] = self._made((args, kwargs), arrays, others, structure)

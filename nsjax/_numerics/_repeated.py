@@ -5,6 +5,7 @@ again. So what is the same at every point is given once, and the results come as
 """
 
 import functools as ft
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -51,22 +52,20 @@ class _At:
     def __init__(self, repeated: Repeated, given: Any) -> None:
         self._repeated, self._given = repeated, given
         self._arrays = jax.device_put(split(given)[0])
-        self._known: Any = None
-        self._ready: dict[Any, Callable[..., Any]] = {}
+        self._ready: dict[Any, Callable[[], Any]] = {}  # weak references: `jax.clear_caches()` lets programs go
 
     @full_products
     def __call__(self, *args: Any) -> Any:
         programs, arrays = self._repeated.programs, jax.tree.leaves(args)
         if trace_context is None or jax.config.values["jax_disable_jit"]:
             return self._repeated.plain(*self._given, *args)
-        known = programs.known()
-        if known is not self._known:  # `jax.clear_caches()` was called
-            self._known, self._ready = known, {}
         kind = (trace_context(), *((x.shape, x.dtype) for x in arrays))
-        if kind not in self._ready:
+        program = self._ready[kind]() if kind in self._ready else None
+        if program is None:
             with without_collection():
-                self._ready[kind] = programs.ready(*self._given, *args)
-        return _apart(*self._ready[kind]([*self._arrays, *arrays]))
+                program = programs.ready(*self._given, *args)
+            self._ready[kind] = weakref.ref(program)
+        return _apart(*program([*self._arrays, *arrays]))
 
 
 def _joined(fn: Callable[..., Any], *args: Any) -> tuple[list[Any], Any]:
