@@ -136,17 +136,20 @@ class Programs:
         self._known = dict if trace_context is None else cache(max_size=None, trace_context_in_key=False)(dict)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return self.ready(*args, **kwargs)(split((args, kwargs))[0])
+        arrays, *rest = split((args, kwargs))
+        return self._ready((args, kwargs), arrays, *rest)(arrays)
 
-    def ready(self, *args: Any, **kwargs: Any) -> "_Program":
+    def ready(self, *args: Any) -> _Program:
         """The program for such arguments, which is called with their arrays."""
-        arrays, others, structure = split((args, kwargs))
+        return self._ready((args, {}), *split((args, {})))
+
+    def _ready(self, given: Any, arrays: list[Any], others: tuple[Any, ...], structure: Any) -> _Program:
         kinds = tuple(jax.typeof(array) for array in arrays)
         signature = (structure, others, tuple(map(type, others)), kinds, trace_context())
         known = self._known()
         program = known.get(signature)
         if program is None:
-            program = known[signature] = self._made((args, kwargs), arrays, others, structure)
+            program = known[signature] = self._made(given, arrays, others, structure)
         return program
 
     def _made(self, given: Any, arrays: list[Any], others: tuple[Any, ...], structure: Any) -> _Program:

@@ -68,10 +68,11 @@ def test_results_of_all_kinds(made):
 
 
 def test_settings_are_part_of_it():
-    at = Repeated(fn).at(MATRIX.astype(np.float32), (jnp.asarray(1.0, jnp.float32), "abc"))
-    assert at(np.ones(2, np.float32)).x.dtype == np.float32
-    with jax.enable_x64(False):
-        assert at(np.ones(2, np.float32)).x.dtype == np.float32
+    """The same arrays, and another program."""
+    at = Repeated(lambda x: (x, jnp.zeros(()))).at()
+    for wanted in (np.float64, np.float32, np.float64):
+        with jax.enable_x64(wanted is np.float64):
+            assert at(np.ones(2, np.float32))[1].dtype == wanted
 
 
 def test_kept_from_one_process_to_the_next(made, tmp_path, monkeypatch):
