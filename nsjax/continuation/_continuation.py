@@ -90,13 +90,19 @@ class AbstractContinuation(abc.ABC, Generic[P, BranchT]):
 
     @classmethod
     def _loaded(
-        cls, archive: Archive, told: Told, for_curve: Callable[[Path], dict[str, Any]], for_explorer: dict[str, Any]
+        cls,
+        archive: Archive,
+        told: Told,
+        for_curve: Callable[[Path], dict[str, Any]],
+        for_explorer: dict[str, Any],
+        smooth: bool = False,
     ) -> Self:
-        """From a file, with what that does not hold: of the curve, given the path of its parameter."""
+        """From a file, with what that does not hold: of the curve, given the path of its parameter. `smooth`: see
+        `SwitchedSystem`."""
         curve_type, tracer_type, explorer_type = cls._parts
         given, time = archive.part("explorer"), jnp.zeros(())  # of which the model takes the shape only
         curve = curve_type(
-            model=SwitchedSystem.forwards(archive.system, time, archive.y),
+            model=SwitchedSystem.forwards(archive.system, time, archive.y, smooth),
             like=archive.y,
             **archive.part("curve"),
             **for_curve(parameter_path(archive.system, given["name"])),

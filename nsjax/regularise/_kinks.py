@@ -1,24 +1,17 @@
-"""Kinks of a continuous vector field, found in its program and made switches.
+"""Kinks of a continuous vector field, made switches: |h| is h s with s = sgn(h), and so are maximum and minimum."""
 
-|h| is h s with s = sgn(h), and so are maximum and minimum: the field's jaxpr is evaluated with switch values put in.
-"""
-
-import contextlib
 import functools as ft
 import itertools
-from collections.abc import Callable, Generator
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from .._numerics._jaxpr import is_affine, is_constant
-from .._numerics._series import _CALLS
+from .._numerics._kinks import evaluate, Walk
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start
 from ..system._sgn import sgn
@@ -26,100 +19,15 @@ from ..system._switch import AbstractSwitch, forwarded
 from ..system._system import arrays_of, SwitchValues, System
 
 
-_KINKS: dict[str, Callable[..., Any]] = {"abs": jnp.abs, "max": jnp.maximum, "min": jnp.minimum, "clamp": lax.clamp}
-_IDLE = {"max": -np.inf, "min": np.inf}  # bounds that never act
-_SMOOTH = ("hypot", "logaddexp", "logaddexp2")  # functions of JAX that are smooth, but written with kinks
 _MOST = 4  # kinks in which the field is not affine: it is evaluated for each combination of their signs
 
-# One evaluation serves to list kinks, to give the h of one of them (it goes no further), and to put switch values in.
-# So it is a generator: it yields the kind and h of each kink, and is sent the value of its switch, or None to leave it.
-_Walk = Generator[tuple[str, Array], Array | None, Any]
 
-
-def _has_kink(e: Any) -> bool:
-    if e.primitive.name in _KINKS:
-        return jnp.issubdtype(e.outvars[0].aval.dtype, jnp.floating)
-    inner = [jaxpr for jaxpr in jex.jaxprs_in_params(e.params) if jaxpr.debug_info.func_name not in _SMOOTH]
-    return any(_has_kink(e) for jaxpr in inner for e in jaxpr.eqns)
-
-
-def _is_known(x: Any) -> bool:
-    """Whether it is a number written in the program: these are kept as NumPy arrays."""
-    return isinstance(x, np.ndarray)
-
-
-def _once(seen: dict[Any, Any], name: Any, fn: Callable[..., Any], *x: Any) -> Any:
-    """`fn(*x)`, kept with x, so that equal values are one object: kinks on the same surface have one switch."""
-    key = (name, *[(v.dtype.str, v.shape, v.tobytes()) if _is_known(v) else id(v) for v in x])
-    if key not in seen:
-        known = all(map(_is_known, x))
-        with jax.ensure_compile_time_eval() if known else contextlib.nullcontext():
-            out = fn(*x)
-        number = isinstance(out, jax.Array) and jnp.issubdtype(out.dtype, jnp.number)
-        seen[key] = np.asarray(out) if known and number else out, x
-    return seen[key][0]
-
-
-def _walk(jaxpr: Any, values: list[Any], seen: dict[Any, Any]) -> _Walk:
-    """Evaluates a program."""
-    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], values))
-
-    def read(v: Any) -> Any:
-        return env[v] if isinstance(v, jex.Var) else np.asarray(v.val, v.aval.dtype)
-
-    for e in jaxpr.eqns:
-        x, name = [read(v) for v in e.invars], e.primitive.name
-        if not _has_kink(e):
-            bind = ft.partial(e.primitive.bind, **e.primitive.get_bind_params(e.params))
-            out = bind(*x) if e.effects else _once(seen, (name, str(e.params)), bind, *x)
-            out = out if e.primitive.multiple_results else [out]
-        elif name in _CALLS:
-            (inner,) = (p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr))
-            out = yield from _walk(inner.jaxpr, [*inner.consts, *x], seen)
-        elif name == "clamp":
-            raised = yield from _kink("max", [x[1], x[0]], seen)
-            out = [(yield from _kink("min", [raised, x[2]], seen))]
-        elif name in _KINKS:
-            out = [(yield from _kink(name, x, seen))]
-        else:
-            raise ValueError(
-                f"A kink (abs, maximum, minimum, clip) inside `{name}` cannot be marked, because it may be met any "
-                "number of times. Write the vector field without the loop or branch, or declare the kink as a `sgn` "
-                "switch."
-            )
-        env.update(zip(e.outvars, out))
-    return [read(v) for v in jaxpr.outvars]
-
-
-def _kink(kind: str, x: list[Any], seen: dict[Any, Any]) -> _Walk:
-    """|h|, or the greater or smaller of two numbers whose difference is h."""
-    x = sorted(x, key=_is_known)  # the surface 0 - x is that of x
-    if _is_known(x[0]):
-        return _once(seen, kind, _KINKS[kind], *x)
-    bound = x[1] if len(x) > 1 and _is_known(x[1]) else None
-    if bound is not None and np.all(bound == _IDLE[kind]):
-        return _once(seen, "spread", lambda a, b: jnp.broadcast_to(a, jnp.broadcast_shapes(a.shape, b.shape)), *x)
-    alone = len(x) == 1 or bound is not None and bound.ndim == 0 and bound == 0
-    h = x[0] if alone else _once(seen, ("sub", "{}"), jnp.subtract, *x)  # as the program's own a - b is known
-    if ("switch", id(h)) not in seen:
-        seen["switch", id(h)] = (yield kind, h), h
-    s, _ = seen["switch", id(h)]
-    if s is None:
-        return _once(seen, kind, _KINKS[kind], *x)
-    size = _once(seen, "size", jnp.multiply, h, s)
-    if len(x) == 1:
-        return size
-    return _once(seen, kind, lambda a, b, size: (a + b + (size if kind == "max" else -size)) / 2, *x, size)
-
-
-def _program(system: System, t: Any, y: Y, s: Any) -> _Walk:
+def _program(system: System, t: Any, y: Y, s: Any) -> Walk:
     """The vector field, for the values `s` of the system's own switches."""
     dtype = jnp.result_type(*jax.tree.leaves(y))
     system = arrays_of(system, dtype)
     args = jax.tree.map(lambda x: jnp.asarray(x, dtype), (t, y, s))
-    closed, f = jax.make_jaxpr(lambda t, y, s: system.vector_field(t, y, system.values(s)), return_shape=True)(*args)
-    out = yield from _walk(closed.jaxpr, [*closed.consts, *jax.tree.leaves(args)], {})
-    return jax.tree.unflatten(jax.tree.structure(f), [jnp.asarray(x) for x in out])
+    return evaluate(lambda t, y, s: system.vector_field(t, y, system.values(s)), *args)
 
 
 @ft.cache  # switches are told apart by identity

@@ -153,7 +153,7 @@ class OrbitContinuation(AbstractContinuation[OrbitPoint, OrbitBranch[StateT]], G
         def for_curve(path: Path) -> dict[str, Any]:
             return dict(free=FreeParameters.of(archive.system, path), integrator=integrator)
 
-        growth = cls._loaded(archive, Told(progress_meter, ends=False), for_curve, dict(recorder=recorder))
+        growth = cls._loaded(archive, Told(progress_meter, ends=False), for_curve, dict(recorder=recorder), smooth=True)
         for name, value in growth._tree.branches[0][1].points[0].record.items():
             recorder.shapes[name] = value.shape
         return growth

@@ -35,7 +35,7 @@ def curve_and_start(
     value = float(get_parameter(system, path))
     check_interval("interval", (low, high), value, f"of `{parameter}` in `system`")
     told = None if scale is None else checked_scale(orbit.y0, scale)
-    model = SwitchedSystem.forwards(system, orbit.t0, orbit.y0)
+    model = SwitchedSystem.forwards(system, orbit.t0, orbit.y0, smooth=True)
     (start,) = starts_of(model, [orbit])
     n = len(start.x[0])
     curve = OrbitCurve(

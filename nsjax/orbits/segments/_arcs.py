@@ -77,7 +77,7 @@ class Flows(eqx.Module):
 
     @property
     def model(self) -> SwitchedSystem:
-        return SwitchedSystem.forwards(self.system, self.t0, self.y0)
+        return SwitchedSystem.forwards(self.system, self.t0, self.y0, smooth=True)
 
     def piece(self, a: Scalar, b: Scalar, x: Array, state: ModeState, saveat: dfx.SaveAt) -> Any:
         unravel = jfu.ravel_pytree(self.y0)[1]
@@ -141,7 +141,7 @@ def _spread(tolerance: Any, y: Y) -> Y:
 def flows_of(system: System, arcs: Arcs, integrator: Integrator) -> tuple[Flows, Float[Array, "arcs pieces n"]]:
     """The flows along the arcs of an orbit, and the states at the beginnings of their pieces."""
     y0, first = (jax.tree.map(lambda y, i=i: y[i], arcs.y) for i in ((0, 0), (slice(None), 0)))
-    model = SwitchedSystem.forwards(system, arcs.begin[0], y0)
+    model = SwitchedSystem.forwards(system, arcs.begin[0], y0, smooth=True)
     within = jax.vmap(lambda t, y, mode: model.state_at(t, y, tuple(mode)))(arcs.begin, first, arcs.mode)
     x = jax.vmap(jax.vmap(lambda y: jfu.ravel_pytree(y)[0]))(arcs.y)
     return Flows(system, within, arcs.begin[0], y0, x.shape[1], integrator), x

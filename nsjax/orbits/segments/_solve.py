@@ -107,7 +107,7 @@ def _problem(
     """The curve of one point, without a parameter, the itinerary with a row for each piece, and a guess of the
     unknowns. They are in the units of the model."""
     y0 = jax.tree.map(lambda y: y[0], guess.y)
-    model = SwitchedSystem.forwards(system, t0, y0)
+    model = SwitchedSystem.forwards(system, t0, y0, smooth=True)
     x = jax.vmap(ravel)(guess.y)
     n, one, none = x.shape[1], jnp.ones_like(t0), jnp.zeros(0, t0.dtype)
     rows, still = guess.itinerary, frozen(model)

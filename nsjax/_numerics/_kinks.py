@@ -1,0 +1,129 @@
+"""Kinks of a function, found in its program: |h|, and the maximum and minimum of two numbers with the difference h.
+
+The jaxpr is evaluated, and where a sign is put in for a kink, |h| is h times that.
+"""
+
+import contextlib
+import functools as ft
+from collections.abc import Callable, Generator
+from typing import Any
+
+import jax
+import jax.extend.core as jex
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ._series import _CALLS
+
+
+_KINKS: dict[str, Callable[..., Any]] = {"abs": jnp.abs, "max": jnp.maximum, "min": jnp.minimum, "clamp": lax.clamp}
+_IDLE = {"max": -np.inf, "min": np.inf}  # bounds that never act
+_SMOOTH = ("hypot", "logaddexp", "logaddexp2")  # functions of JAX that are smooth, but written with kinks
+
+# One evaluation serves to list kinks, to give the h of one of them (it goes no further), and to put signs in. So it is
+# a generator: it yields the kind and h of each kink, and is sent the sign of h, or None to leave it as it is.
+Walk = Generator[tuple[str, Array], Array | None, Any]
+Seen = dict[Any, Any]
+"""Values by the operation and the arguments they came from."""
+
+
+def _has_kink(e: Any) -> bool:
+    if e.primitive.name in _KINKS:
+        return jnp.issubdtype(e.outvars[0].aval.dtype, jnp.floating)
+    inner = [jaxpr for jaxpr in jex.jaxprs_in_params(e.params) if jaxpr.debug_info.func_name not in _SMOOTH]
+    return any(_has_kink(e) for jaxpr in inner for e in jaxpr.eqns)
+
+
+def _is_known(x: Any) -> bool:
+    """Whether it is a number written in the program: these are kept as NumPy arrays."""
+    return isinstance(x, np.ndarray)
+
+
+def _once(seen: Seen, name: Any, fn: Callable[..., Any], *x: Any) -> Any:
+    """`fn(*x)`, kept with x, so that equal values are one object: kinks on the same surface have one switch."""
+    key = (name, *[(v.dtype.str, v.shape, v.tobytes()) if _is_known(v) else id(v) for v in x])
+    if key not in seen:
+        known = all(map(_is_known, x))
+        with jax.ensure_compile_time_eval() if known else contextlib.nullcontext():
+            out = fn(*x)
+        number = isinstance(out, jax.Array) and jnp.issubdtype(out.dtype, jnp.number)
+        seen[key] = np.asarray(out) if known and number else out, x
+    return seen[key][0]
+
+
+def _walk(jaxpr: Any, values: list[Any], seen: Seen) -> Walk:
+    """Evaluates a program."""
+    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], values))
+
+    def read(v: Any) -> Any:
+        return env[v] if isinstance(v, jex.Var) else np.asarray(v.val, v.aval.dtype)
+
+    for e in jaxpr.eqns:
+        x, name = [read(v) for v in e.invars], e.primitive.name
+        if not _has_kink(e):
+            bind = ft.partial(e.primitive.bind, **e.primitive.get_bind_params(e.params))
+            out = bind(*x) if e.effects else _once(seen, (name, str(e.params)), bind, *x)
+            out = out if e.primitive.multiple_results else [out]
+        elif name in _CALLS:
+            (inner,) = (p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr))
+            out = yield from _walk(inner.jaxpr, [*inner.consts, *x], seen)
+        elif name == "clamp":
+            raised = yield from _kink("max", [x[1], x[0]], seen)
+            out = [(yield from _kink("min", [raised, x[2]], seen))]
+        elif name in _KINKS:
+            out = [(yield from _kink(name, x, seen))]
+        else:
+            raise ValueError(
+                f"A kink (abs, maximum, minimum, clip) inside `{name}` cannot be marked, because it may be met any "
+                "number of times. Write the vector field without the loop or branch, or declare the kink as a `sgn` "
+                "switch."
+            )
+        env.update(zip(e.outvars, out))
+    return [read(v) for v in jaxpr.outvars]
+
+
+def _kink(kind: str, x: list[Any], seen: Seen) -> Walk:
+    """|h|, or the greater or smaller of two numbers whose difference is h."""
+    x = sorted(x, key=_is_known)  # the surface 0 - x is that of x
+    if _is_known(x[0]):
+        return _once(seen, kind, _KINKS[kind], *x)
+    bound = x[1] if len(x) > 1 and _is_known(x[1]) else None
+    if bound is not None and np.all(bound == _IDLE[kind]):
+        return _once(seen, "spread", lambda a, b: jnp.broadcast_to(a, jnp.broadcast_shapes(a.shape, b.shape)), *x)
+    alone = len(x) == 1 or bound is not None and bound.ndim == 0 and bound == 0
+    h = x[0] if alone else _once(seen, ("sub", "{}"), jnp.subtract, *x)  # as the program's own a - b is known
+    if ("switch", id(h)) not in seen:
+        seen["switch", id(h)] = (yield kind, h), h
+    s, _ = seen["switch", id(h)]
+    if s is None:
+        return _once(seen, kind, _KINKS[kind], *x)
+    size = _once(seen, "size", jnp.multiply, h, s)
+    if len(x) == 1:
+        return size
+    return _once(seen, kind, lambda a, b, size: (a + b + (size if kind == "max" else -size)) / 2, *x, size)
+
+
+def evaluate(fn: Callable[..., Any], *args: Any, seen: Seen | None = None) -> Walk:
+    """Evaluates a function of pytrees of arrays."""
+    closed, out = jax.make_jaxpr(fn, return_shape=True)(*args)
+    values = [*closed.consts, *jax.tree.leaves(args)]
+    found = yield from _walk(closed.jaxpr, values, {} if seen is None else seen)
+    return jax.tree.unflatten(jax.tree.structure(out), [jnp.asarray(x) for x in found])
+
+
+def has_kinks(fn: Callable[..., Any], *args: Any) -> bool:
+    return any(map(_has_kink, jax.make_jaxpr(fn)(*args).jaxpr.eqns))
+
+
+def sign_of(h: Any, other: Any, seen: Seen) -> int:
+    """1 if two numbers came from the same operations, -1 if one was made as the negative of the other; 0 if neither."""
+    if h is other:
+        return 1
+    for (name, *parts), (out, x) in seen.items():
+        negated = name == ("neg", "{}") and {id(out), id(x[0])} == {id(h), id(other)}
+        swapped = name == ("sub", "{}") and out is h and seen.get((name, *parts[::-1]), (None,))[0] is other
+        if negated or swapped:
+            return -1
+    return 0

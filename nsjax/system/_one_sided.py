@@ -1,0 +1,90 @@
+"""A field that is smooth on both sides of its surfaces in each mode, where it is written with |h|.
+
+Friction that depends on the sliding velocity is written with |v_rel|, and v_rel = 0 is the surface of its switch. In a
+mode |h| is h or -h. On the surface itself, where every mode begins or ends, rounding chooses which of them a program
+takes, and beside it a search that has not converged is on the other side. A solution takes no notice; the equations of
+a periodic orbit, and their derivatives, are those of the mode only if it is told which one to take.
+"""
+
+import itertools
+from collections.abc import Callable
+from typing import Any, NamedTuple, TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+
+from .._numerics._kinks import evaluate, has_kinks, Seen, sign_of
+from .._types import Scalar, Y
+from ._sgn import sgn
+from ._system import arrays_of, System
+
+
+if TYPE_CHECKING:
+    from ._model import SwitchedSystem
+
+
+class Side(NamedTuple):
+    """A kink on the surface of a switch."""
+
+    kink: int  # its number, as they are met in the program of the field
+    switch: int
+    sign: int  # of its h, where that of the switch is positive
+
+
+def sides_of(model: "SwitchedSystem", t: Scalar, y: Y) -> tuple[Side, ...]:
+    """The kinks of a model's field on surfaces of its own `sgn` switches, as the operations tell that they are there:
+    of the same difference, or of its negative. None of a field with a kink within a loop."""
+    own = [k for k, switch in enumerate(model.switches) if isinstance(switch, sgn) and model.parts[k] == 1]
+    own = [k for k in own if not model.conditional(k)]
+    args, system = _arguments(model.system, t, y, tuple(0.0 for _ in model.switches))
+    if not own or not has_kinks(lambda args: _field(system(args), *args[1:]), args):
+        return ()
+    found: list[Side] = []
+
+    def both(args: Any) -> tuple[Y, list[Scalar]]:
+        whole, (_, t, y, _) = system(args), args
+        return _field(whole, *args[1:]), [whole.switches[k].components(whole, t, y)[0] for k in own]
+
+    def look(args: Any) -> None:
+        seen: Seen = {}
+        walk, kinks = evaluate(both, args, seen=seen), []
+        try:
+            while True:
+                kinks.append(next(walk)[1])
+        except StopIteration as end:
+            surfaces = end.value[1]
+        except ValueError:
+            return
+        sides = [Side(i, k, sign_of(h, level, seen)) for i, h in enumerate(kinks) for k, level in zip(own, surfaces)]
+        found.extend(side for side in sides if side.sign)
+
+    jax.eval_shape(look, args)  # of which nothing stays in a program that is being traced
+    return tuple(found)
+
+
+def one_sided(system: System, sides: tuple[Side, ...], t: Scalar, y: Y, s: tuple[Any, ...]) -> Y:
+    """The vector field, with the signs of some kinks taken from the switches (zero where one holds)."""
+    signs = {side.kink: side.sign * lax.stop_gradient(jnp.sign(s[side.switch])) for side in sides}
+    args, whole = _arguments(system, t, y, s)
+    walk, sent = evaluate(lambda args: _field(whole(args), *args[1:]), args), None
+    for i in itertools.count():
+        try:
+            walk.send(sent)
+        except StopIteration as end:
+            return end.value
+        sent = signs.get(i)
+
+
+def _field(system: System, t: Scalar, y: Y, s: tuple[Any, ...]) -> Y:
+    return system.vector_field(t, y, system.values(s))
+
+
+def _arguments(system: System, t: Scalar, y: Y, s: tuple[Any, ...]) -> tuple[tuple, Callable[[tuple], System]]:
+    """As arrays, the numbers of the system first (not within the program, where equal numbers would be the same one);
+    and how they make the system again."""
+    dtype = jnp.result_type(*jax.tree.leaves(y))
+    numbers, rest = eqx.partition(arrays_of(system, dtype), eqx.is_array)
+    args = (numbers, *jax.tree.map(lambda x: jnp.asarray(x, dtype), (t, y, s)))
+    return args, lambda args: eqx.combine(args[0], rest)

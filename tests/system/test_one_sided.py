@@ -1,0 +1,158 @@
+"""Friction that is written with |v_rel|: in a mode the field is smooth on both sides of its surface."""
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import Motion
+from scipy.integrate import solve_ivp
+
+import nsjax
+from nsjax.system._mode import ModeState
+from nsjax.system._model import SwitchedSystem
+from nsjax.system._one_sided import Side
+
+
+class Belt(nsjax.System):
+    """A mass on a spring that hardens, and on a belt whose friction falls with the sliding velocity."""
+
+    v_dr: float = 0.2
+    k_3: float = 0.3
+    delta: float = 3.0
+
+    def friction(self, y, s):
+        raise NotImplementedError
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - self.k_3 * y.x**3 + self.friction(y, s))
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return self.v_dr - y.v
+
+
+class Written(Belt):
+    """Each law by itself."""
+
+    def friction(self, y, s):
+        h = self.delta * (self.v_dr - y.v)
+        return 0.5 * (1 + s.belt) / (1 + h) - 0.5 * (1 - s.belt) / (1 - h)
+
+
+class Same(Belt):
+    def friction(self, y, s):
+        return s.belt / (1 + self.delta * jnp.abs(self.v_dr - y.v))
+
+
+class Turned(Belt):
+    def friction(self, y, s):
+        return s.belt / (1 + self.delta * jnp.abs(y.v - self.v_dr))
+
+
+class Negative(Belt):
+    def friction(self, y, s):
+        return s.belt / (1 + self.delta * jnp.abs(-(self.v_dr - y.v)))
+
+
+class Greater(Belt):
+    """|h| as max(h, -h), by way of `jnp.maximum(h, 0)`."""
+
+    def friction(self, y, s):
+        h = self.v_dr - y.v
+        return s.belt / (1 + self.delta * (2 * jnp.maximum(h, 0.0) - h))
+
+
+class Elsewhere(Belt):
+    """A kink that is on no surface, beside one that is."""
+
+    def friction(self, y, s):
+        return s.belt / (1 + self.delta * jnp.abs(self.v_dr - y.v)) + 0 * jnp.abs(y.x - self.v_dr)
+
+
+class Alike(Belt):
+    """Another number of the same value, which is not the velocity of the belt."""
+
+    v_0: float = 0.2
+
+    def friction(self, y, s):
+        return s.belt / (1 + self.delta * jnp.abs(self.v_0 - y.v))
+
+
+class Looped(Belt):
+    def friction(self, y, s):
+        return s.belt / (1 + lax.fori_loop(0, 3, lambda i, w: w + jnp.abs(self.v_dr - y.v), jnp.zeros_like(y.v)))
+
+
+def model_of(system, smooth=True):
+    return SwitchedSystem.forwards(system, jnp.zeros(()), Motion(jnp.ones(()), jnp.ones(())), smooth)
+
+
+@pytest.mark.parametrize(
+    "system, sides",
+    [
+        (Same(), (Side(0, 0, 1),)),
+        (Turned(), (Side(0, 0, -1),)),
+        (Negative(), (Side(0, 0, -1),)),
+        (Greater(), (Side(0, 0, 1),)),
+        (Elsewhere(), (Side(0, 0, 1),)),
+        (Alike(), ()),
+        (Looped(), ()),
+        (Written(), ()),
+    ],
+    ids=lambda x: type(x).__name__,
+)
+def test_told_by_the_operations(system, sides):
+    assert model_of(system).sides == sides
+    assert not model_of(system, smooth=False).sides
+    assert jax.jit(lambda v_dr: len(model_of(type(system)(v_dr=v_dr)).sides) + jnp.zeros(()))(0.3) == len(sides)
+
+
+@pytest.mark.parametrize("system", [Same(), Turned(), Negative(), Greater(), Elsewhere()], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize("mode", [-1, 0, 1])
+def test_flow_of_a_mode_is_smooth_beyond_its_surface(system, mode):
+    """On both sides and on the surface, with derivatives by state and parameters, as of the laws one by one."""
+    state = ModeState.of([jnp.asarray(mode, jnp.int32)], [None])
+
+    def flow(system, x, v):
+        f = model_of(system).flow(jnp.zeros(()), Motion(x, v), state)
+        return jnp.stack([f.x, f.v])
+
+    for v in [0.2] if mode == 0 else [0.2, 0.25, 0.15, 0.2 + 1e-17]:  # what holds is on the surface
+
+        def numbers(kind, v=v):
+            def of(z):
+                return flow(kind(v_dr=z[2], delta=z[3]), z[0], z[1])
+
+            z = jnp.asarray([0.4, v, 0.2, 3.0])
+            return of(z), jax.jacfwd(of)(z)
+
+        for got, want in zip(numbers(type(system)), numbers(Written)):
+            np.testing.assert_allclose(got, want, atol=1e-14)
+
+
+def period_of(v_dr, k_3=0.3, delta=3.0):
+    """It sticks until the spring is as strong as friction, slips until it is as fast as the belt, and sticks again."""
+    x = np.real(next(r for r in np.roots([k_3, 0, 1, -1]) if abs(r.imag) < 1e-12))
+
+    def slip(t, y):
+        return [y[1], -y[0] - k_3 * y[0] ** 3 + 1 / (1 + delta * (v_dr - y[1]))]
+
+    def caught(t, y):
+        return y[1] - v_dr if t > 0.5 else -1.0
+
+    caught.terminal = True
+    end = solve_ivp(slip, (0, 50), [x, v_dr], "DOP853", rtol=1e-12, atol=1e-12, events=caught)
+    return end.t[-1] + (x - end.y[0, -1]) / v_dr
+
+
+def test_a_branch_with_falling_friction():
+    """It ended after a millionth of the interval, as Newton's method came to both sides of the surface."""
+    system = Turned()
+    orbit = nsjax.find_orbit(system, Motion(1.0, 0.2), period=12.0)
+    branch = nsjax.continue_orbit(system, orbit, "v_dr", (0.19, 0.21), max_branches=1, max_step=0.1)
+    assert len(branch) < 30 and np.all(branch.stable)
+    np.testing.assert_allclose([branch.values[0], branch.values[-1]], [0.19, 0.21], atol=1e-12)
+    np.testing.assert_allclose(branch.multipliers, np.tile([1.0, 0.0], (len(branch), 1)), atol=1e-8)
+    for i in (0, -1):
+        np.testing.assert_allclose(branch.periods[i], period_of(branch.values[i]), rtol=1e-9)
