@@ -12,7 +12,7 @@ import numpy as np
 
 from ._products import full_products
 from ._programs import is_kept, Programs
-from ._whole_loops import whole_loops
+from ._whole_loops import LOOPS, whole_loops
 
 
 try:
@@ -49,18 +49,20 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 # The older emitters of XLA's CPU compiler take a third to a half off its time. In batches their programs are up to 1.4
 # times slower: those are compiled by the user's own `jax.jit`, or by `nsjax.sweep`, without them.
-OFTEN: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+KERNELS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
 # Nothing of LLVM's optimisation takes off another third. With its loop as one function a solution runs two to five
-# times as fast all the same; a product by the library for large ones would keep it from being that.
-QUICK = {**OFTEN, "xla_backend_optimization_level": 0, "xla_cpu_experimental_ynn_fusion_type": ""}
+# times as fast all the same.
+QUICK = {**LOOPS, "xla_backend_optimization_level": 0}
 
 
 @ft.cache
-def options(often: bool = False) -> dict[str, Any]:
-    """Those that this version of XLA knows; on other devices than a CPU none of them are of use."""
+def options(often: bool = False, loops: bool = True) -> dict[str, Any]:
+    """Those that this version of XLA knows, of a program that is called a few times or `often`, with its `loops` as one
+    function each or not; on other devices than a CPU none of them are of use."""
     if jax.default_backend() != "cpu":
         return {}
-    wanted, trivial = OFTEN if often else QUICK, jax.jit(lambda x: x).lower(0.0)
+    wanted = (LOOPS if often else QUICK) if loops else KERNELS
+    trivial = jax.jit(lambda x: x).lower(0.0)
     known: dict[str, Any] = {}
     with contextlib.suppress(Exception):  # nearly always all of them
         trivial.compile(dict(wanted))

@@ -16,6 +16,7 @@ import numpy as np
 from ._compile import interactive, on_host, options, without_collection
 from ._products import full_products
 from ._programs import Programs, split, trace_context
+from ._whole_loops import whole_loops
 
 
 class Same:
@@ -40,29 +41,34 @@ class Repeated:
     """
 
     def __init__(self, fn: Callable[..., Any]) -> None:
-        self.programs = Programs(ft.partial(_joined, fn), ft.partial(options, often=True))
+        joined = ft.partial(_joined, fn)
+        self.programs = [Programs(joined, ft.partial(options, often=True, loops=loops)) for loops in (False, True)]
         self.plain = interactive(fn, host=True)
 
-    def at(self, *given: Any) -> Callable[..., Any]:
-        """With its first arguments given: a function of the others, which are arrays, or tuples of them."""
-        return _At(self, given)
+    def at(self, *given: Any, loops: bool = False) -> Callable[..., Any]:
+        """With its first arguments given: a function of the others, which are arrays, or tuples of them.
+
+        With its `loops` as one function each a program takes a fifth longer to compile: that pays where they have many
+        turns.
+        """
+        return _At(self, given, loops)
 
 
 class _At:
-    def __init__(self, repeated: Repeated, given: Any) -> None:
-        self._repeated, self._given = repeated, given
+    def __init__(self, repeated: Repeated, given: Any, loops: bool) -> None:
+        self._repeated, self._given, self._loops = repeated, given, loops
         self._arrays = jax.device_put(split(given)[0])
         self._ready: dict[Any, Callable[[], Any]] = {}  # weak references: `jax.clear_caches()` lets programs go
 
     @full_products
     def __call__(self, *args: Any) -> Any:
-        programs, arrays = self._repeated.programs, jax.tree.leaves(args)
+        programs, arrays = self._repeated.programs[self._loops], jax.tree.leaves(args)
         if trace_context is None or jax.config.values["jax_disable_jit"]:
             return self._repeated.plain(*self._given, *args)
         kind = (trace_context(), *((x.shape, x.dtype) for x in arrays))
         program = self._ready[kind]() if kind in self._ready else None
         if program is None:
-            with without_collection():
+            with without_collection(), whole_loops(self._loops):
                 program = programs.ready(*self._given, *args)
             self._ready[kind] = weakref.ref(program)
         return _apart(*program([*self._arrays, *arrays]))

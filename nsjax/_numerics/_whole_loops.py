@@ -27,9 +27,9 @@ except ImportError:  # then loops are compiled as elsewhere
 
 NAME, BYTES = "xla_cpu_small_while_loop_byte_threshold", "1000000000"
 
-# What goes with loops of many lanes as one function: without the newer emitters, without the library that would keep
-# products out of them, and with as much of LLVM's optimisation as changes anything.
-LANES: dict[str, Any] = {
+# What goes with loops as one function: without the newer emitters, without the library that would keep products out of
+# them, and with as much of LLVM's optimisation as changes anything.
+LOOPS: dict[str, Any] = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_experimental_ynn_fusion_type": "",
     "xla_backend_optimization_level": 1,
@@ -100,7 +100,7 @@ def _all_known() -> bool:
     if jax.default_backend() != "cpu":
         return False
     with on_request(), contextlib.suppress(Exception):
-        jax.jit(lambda x: x).lower(0.0).compile(dict(LANES))
+        jax.jit(lambda x: x).lower(0.0).compile(dict(LOOPS))
         return True
     return False
 
@@ -117,7 +117,7 @@ def _install() -> None:
             with contextlib.suppress(Exception):  # those of another version
                 options = CompileOptions.ParseFromString(options.SerializeAsString() + _ADDED)
                 if asked:
-                    new = [(name, value) for name, value in LANES.items() if name not in flags]
+                    new = [(name, value) for name, value in LOOPS.items() if name not in flags]
                     options.env_option_overrides = [*options.env_option_overrides, *new]
         return options
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nsjax._numerics import _programs
+from nsjax._numerics import _programs, _whole_loops
 from nsjax._numerics._programs import keep_programs, Programs
 from nsjax._numerics._repeated import Repeated, Same
 
@@ -51,10 +51,15 @@ def check(found, a, x):
     assert kinds == [(np.ndarray, np.dtype(kind), shape) for kind, shape in shapes]
 
 
-def test_results_of_all_kinds(made):
-    repeated = Repeated(fn)
+@pytest.mark.parametrize("loops", [False, True])
+def test_results_of_all_kinds(made, loops):
+    def told(*args):
+        assert _whole_loops._here.wanted == loops
+        return fn(*args)
+
+    repeated = Repeated(told)
     for a in (1.0, 2.0):  # other arrays are no other program
-        at = repeated.at(MATRIX, (jnp.asarray(a), "abc"))
+        at = repeated.at(MATRIX, (jnp.asarray(a), "abc"), loops=loops)
         for x in (np.asarray([1.0, 2.0]), np.asarray([1.0, -2.0])):
             check(at(x), a, x)
     assert len(made) == 1
@@ -63,6 +68,8 @@ def test_results_of_all_kinds(made):
     jax.clear_caches()
     check(at(np.ones(2)), 2.0, np.ones(2))
     assert len(made) == 3
+    repeated = Repeated(fn)
+    at = repeated.at(MATRIX, (jnp.asarray(2.0), "abc"), loops=loops)
     with jax.disable_jit():
         check(at(np.ones(2)), 2.0, np.ones(2))
 

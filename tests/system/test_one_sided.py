@@ -108,7 +108,9 @@ def test_told_by_the_operations(system, sides):
     assert jax.jit(lambda v_dr: len(model_of(type(system)(v_dr=v_dr)).sides) + jnp.zeros(()))(0.3) == len(sides)
 
 
-@pytest.mark.parametrize("system", [Same(), Turned(), Negative(), Greater(), Elsewhere()], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize(
+    "system", [Same(), Turned(), Negative(), Greater(), Elsewhere()], ids=lambda x: type(x).__name__
+)
 @pytest.mark.parametrize("mode", [-1, 0, 1])
 def test_flow_of_a_mode_is_smooth_beyond_its_surface(system, mode):
     """On both sides and on the surface, with derivatives by state and parameters, as of the laws one by one."""

@@ -84,8 +84,12 @@ class OrbitCurve(eqx.Module):
 
     def flow(self, value: Array) -> SegmentFlow:
         """That of the modes with a value of the parameter (or of several)."""
-        exact = self.exact == ALWAYS or (self.exact == FREE_MODES and not self.slides)
-        return SegmentFlow(self.model, self.free, value, self.like, self.integrator, exact, self.slides)
+        return SegmentFlow(self.model, self.free, value, self.like, self.integrator, self.exactly, self.slides)
+
+    @property
+    def exactly(self) -> bool:
+        """Whether flows are known by their exponentials; else they are steps of the solver."""
+        return self.exact == ALWAYS or (self.exact == FREE_MODES and not self.slides)
 
     @property
     def autonomous(self) -> bool:
