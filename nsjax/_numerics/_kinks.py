@@ -117,13 +117,36 @@ def has_kinks(fn: Callable[..., Any], *args: Any) -> bool:
     return any(map(_has_kink, jax.make_jaxpr(fn)(*args).jaxpr.eqns))
 
 
-def sign_of(h: Any, other: Any, seen: Seen) -> int:
-    """1 if two numbers came from the same operations, -1 if one was made as the negative of the other; 0 if neither."""
+_NEGATIVE = -1
+_LEADING = {"neg": {_NEGATIVE: 0}, "mul": {0: 0, 1: 1}, "div": {0: 0}}  # operations: the steps, and to which argument
+_NOWHERE = "", (), ()
+
+
+def origins(seen: Seen) -> dict[int, tuple[str, tuple, tuple]]:
+    """Of each number: the operation that it came from, by what its arguments are told apart, and these."""
+    return {id(out): (name[0], tuple(parts), x) for (name, *parts), (out, x) in seen.items()}
+
+
+def way_to(h: Any, other: Any, origin: dict[int, Any]) -> tuple[int, ...] | None:
+    """How a number was made of another one: a product or quotient is told by the place of the factor that leads there,
+    a negative or the opposite difference by -1. None if it was not."""
     if h is other:
-        return 1
-    for (name, *parts), (out, x) in seen.items():
-        negated = name == ("neg", "{}") and {id(out), id(x[0])} == {id(h), id(other)}
-        swapped = name == ("sub", "{}") and out is h and seen.get((name, *parts[::-1]), (None,))[0] is other
-        if negated or swapped:
-            return -1
-    return 0
+        return ()
+    name, parts, x = origin.get(id(h), _NOWHERE)
+    if name == "sub" and origin.get(id(other), _NOWHERE)[:2] == ("sub", parts[::-1]):
+        return (_NEGATIVE,)
+    for step, place in _LEADING.get(name, {}).items():
+        rest = way_to(x[place], other, origin)
+        if rest is not None:
+            return step, *rest
+    return None
+
+
+def sign_along(h: Any, way: tuple[int, ...], origin: dict[int, Any]) -> Any:
+    """The sign of a number, relative to the one to which that way leads."""
+    sign: Any = 1
+    for step in way:
+        _, _, x = origin[id(h)]
+        sign = -sign if step == _NEGATIVE else sign * jnp.sign(x[1 - step])
+        h = x[max(step, 0)]
+    return sign

@@ -15,7 +15,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 
-from .._numerics._kinks import evaluate, has_kinks, Seen, sign_of
+from .._numerics._kinks import evaluate, has_kinks, origins, Seen, sign_along, way_to
 from .._types import Scalar, Y
 from ._sgn import sgn
 from ._system import arrays_of, System
@@ -30,12 +30,12 @@ class Side(NamedTuple):
 
     kink: int  # its number, as they are met in the program of the field
     switch: int
-    sign: int  # of its h, where that of the switch is positive
+    way: tuple[int, ...]  # from its h to that of the switch, see `way_to`
 
 
 def sides_of(model: "SwitchedSystem", t: Scalar, y: Y) -> tuple[Side, ...]:
     """The kinks of a model's field on surfaces of its own `sgn` switches, as the operations tell that they are there:
-    of the same difference, or of its negative. None of a field with a kink within a loop."""
+    of the same difference, of its negative or a multiple. None of a field with a kink within a loop."""
     own = [k for k, switch in enumerate(model.switches) if isinstance(switch, sgn) and model.parts[k] == 1]
     own = [k for k in own if not model.conditional(k)]
     args, system = _arguments(model.system, t, y, tuple(0.0 for _ in model.switches))
@@ -57,8 +57,10 @@ def sides_of(model: "SwitchedSystem", t: Scalar, y: Y) -> tuple[Side, ...]:
             surfaces = end.value[1]
         except ValueError:
             return
-        sides = [Side(i, k, sign_of(h, level, seen)) for i, h in enumerate(kinks) for k, level in zip(own, surfaces)]
-        found.extend(side for side in sides if side.sign)
+        origin = origins(seen)
+        for i, h in enumerate(kinks):
+            ways = ((k, way_to(h, level, origin)) for k, level in zip(own, surfaces))
+            found.extend(Side(i, k, way) for k, way in ways if way is not None)
 
     jax.eval_shape(look, args)  # of which nothing stays in a program that is being traced
     return tuple(found)
@@ -66,15 +68,18 @@ def sides_of(model: "SwitchedSystem", t: Scalar, y: Y) -> tuple[Side, ...]:
 
 def one_sided(system: System, sides: tuple[Side, ...], t: Scalar, y: Y, s: tuple[Any, ...]) -> Y:
     """The vector field, with the signs of some kinks taken from the switches (zero where one holds)."""
-    signs = {side.kink: side.sign * lax.stop_gradient(jnp.sign(s[side.switch])) for side in sides}
+    at = {side.kink: side for side in sides}
     args, whole = _arguments(system, t, y, s)
-    walk, sent = evaluate(lambda args: _field(whole(args), *args[1:]), args), None
+    seen: Seen = {}
+    walk, sent = evaluate(lambda args: _field(whole(args), *args[1:]), args, seen=seen), None
     for i in itertools.count():
         try:
-            walk.send(sent)
+            _, h = walk.send(sent)
         except StopIteration as end:
             return end.value
-        sent = signs.get(i)
+        sent = None
+        if i in at:
+            sent = lax.stop_gradient(sign_along(h, at[i].way, origins(seen)) * jnp.sign(s[at[i].switch]))
 
 
 def _field(system: System, t: Scalar, y: Y, s: tuple[Any, ...]) -> Y:

@@ -63,6 +63,18 @@ class Greater(Belt):
         return s.belt / (1 + self.delta * (2 * jnp.maximum(h, 0.0) - h))
 
 
+class Scaled(Belt):
+    """As by a velocity that is characteristic of the law."""
+
+    def friction(self, y, s):
+        return s.belt / (1 + jnp.abs((y.v - self.v_dr) / (-1 / self.delta)))
+
+
+class Twice(Belt):
+    def friction(self, y, s):
+        return s.belt / (1 + jnp.abs(self.delta * (2.0 * -(self.v_dr - y.v)) * 0.5))
+
+
 class Elsewhere(Belt):
     """A kink that is on no surface, beside one that is."""
 
@@ -84,6 +96,9 @@ class Looped(Belt):
         return s.belt / (1 + lax.fori_loop(0, 3, lambda i, w: w + jnp.abs(self.v_dr - y.v), jnp.zeros_like(y.v)))
 
 
+SMOOTH = [Same(), Turned(), Negative(), Greater(), Scaled(), Twice(), Elsewhere()]
+
+
 def model_of(system, smooth=True):
     return SwitchedSystem.forwards(system, jnp.zeros(()), Motion(jnp.ones(()), jnp.ones(())), smooth)
 
@@ -91,11 +106,13 @@ def model_of(system, smooth=True):
 @pytest.mark.parametrize(
     "system, sides",
     [
-        (Same(), (Side(0, 0, 1),)),
-        (Turned(), (Side(0, 0, -1),)),
-        (Negative(), (Side(0, 0, -1),)),
-        (Greater(), (Side(0, 0, 1),)),
-        (Elsewhere(), (Side(0, 0, 1),)),
+        (Same(), (Side(0, 0, ()),)),
+        (Turned(), (Side(0, 0, (-1,)),)),
+        (Negative(), (Side(0, 0, (-1,)),)),
+        (Greater(), (Side(0, 0, ()),)),
+        (Scaled(), (Side(0, 0, (0, -1)),)),
+        (Twice(), (Side(0, 0, (0, 1, 1, -1)),)),
+        (Elsewhere(), (Side(0, 0, ()),)),
         (Alike(), ()),
         (Looped(), ()),
         (Written(), ()),
@@ -108,9 +125,7 @@ def test_told_by_the_operations(system, sides):
     assert jax.jit(lambda v_dr: len(model_of(type(system)(v_dr=v_dr)).sides) + jnp.zeros(()))(0.3) == len(sides)
 
 
-@pytest.mark.parametrize(
-    "system", [Same(), Turned(), Negative(), Greater(), Elsewhere()], ids=lambda x: type(x).__name__
-)
+@pytest.mark.parametrize("system", SMOOTH, ids=lambda x: type(x).__name__)
 @pytest.mark.parametrize("mode", [-1, 0, 1])
 def test_flow_of_a_mode_is_smooth_beyond_its_surface(system, mode):
     """On both sides and on the surface, with derivatives by state and parameters, as of the laws one by one."""
