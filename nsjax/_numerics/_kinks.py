@@ -20,6 +20,7 @@ from ._series import _CALLS
 
 _KINKS: dict[str, Callable[..., Any]] = {"abs": jnp.abs, "max": jnp.maximum, "min": jnp.minimum, "clamp": lax.clamp}
 _IDLE = {"max": -np.inf, "min": np.inf}  # bounds that never act
+_PARTIAL = ("pow", "sqrt", "rsqrt", "log", "log1p", "acos", "asin", "acosh", "atanh")
 _SMOOTH = ("hypot", "logaddexp", "logaddexp2")  # functions of JAX that are smooth, but written with kinks
 
 # One evaluation serves to list kinks, to give the h of one of them (it goes no further), and to put signs in. So it is
@@ -115,6 +116,17 @@ def evaluate(fn: Callable[..., Any], *args: Any, seen: Seen | None = None) -> Wa
 
 def has_kinks(fn: Callable[..., Any], *args: Any) -> bool:
     return any(map(_has_kink, jax.make_jaxpr(fn)(*args).jaxpr.eqns))
+
+
+def is_partial(fn: Callable[..., Any], *args: Any) -> bool:
+    """Whether a function has parts that are not defined for all numbers, as powers are not for negative ones. (That
+    quotients are not either does not count.)"""
+
+    def within(jaxpr: Any) -> bool:
+        inner = (j for e in jaxpr.eqns for j in jex.jaxprs_in_params(e.params))
+        return any(e.primitive.name in _PARTIAL for e in jaxpr.eqns) or any(map(within, inner))
+
+    return within(jax.make_jaxpr(fn)(*args).jaxpr)
 
 
 _NEGATIVE = -1

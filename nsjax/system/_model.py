@@ -24,7 +24,7 @@ from .._types import Mode, Scalar, Y
 from ._clocked import Clocked
 from ._coupling import Coupling
 from ._mode import BEYOND, ModeState, OFF, pick, put, Slot
-from ._one_sided import one_sided, Side, sides_of
+from ._one_sided import one_sided, Sides, sides_of
 from ._sliding import linearised, project, resolved
 from ._system import System
 
@@ -50,12 +50,12 @@ class SwitchedSystem(Clocked):
     apart: tuple[bool, ...] = eqx.field(static=True)  # which have nothing to do with the mode of any other
     contact: tuple[int, ...] = eqx.field(static=True)  # of each the switch while whose contact is closed it is there
     slots: tuple[Slot, ...] = eqx.field(static=True)
-    sides: tuple[Side, ...] = eqx.field(static=True)  # kinks of the field that have the sign of the mode
+    sides: Sides | None = eqx.field(static=True)  # kinks of the field that have the sign of the mode
 
     def __init__(self, system: System, direction: Any, t: Scalar, y: Y, smooth: bool = False):
         """`smooth`: whether the field of a mode is to be smooth beyond its surfaces, see `_one_sided`."""
         super().__init__(system, direction)
-        self.sides = ()
+        self.sides = None
         self.parts = tuple(len(k.components(system, t, y)) for k in self.switches)
         zeros = tuple(jnp.zeros((), jnp.result_type(t)) for _ in self.switches)
         one, order = jnp.ones_like(t), [switch.order for switch in self.switches]
@@ -121,7 +121,7 @@ class SwitchedSystem(Clocked):
             if k in self.holdable:
                 slots += [Slot(k, sign, True) for sign in ((1,) if k in self.contacts else (1, -1))]
         self.slots = tuple(slots)
-        self.sides = sides_of(self, t, y) if smooth else ()
+        self.sides = sides_of(self, t, y) if smooth else None
 
     def _reach(self, which: Sequence[int], fn: Callable[[tuple], Any], zeros: tuple) -> np.ndarray:
         """Which results of `fn` (for each switch in `which` as many as it has components) depend on which values."""
@@ -148,7 +148,7 @@ class SwitchedSystem(Clocked):
     # The smooth field for given switch values, and the indicator functions.
 
     def field(self, t: Scalar, y: Y, s: tuple[Any, ...]) -> Y:
-        if self.sides:
+        if self.sides is not None:
             f = one_sided(self.system, self.sides, self.time(t), y, s)
         else:
             f = self.system.vector_field(self.time(t), y, self.system.values(s))

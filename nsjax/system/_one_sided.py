@@ -6,6 +6,7 @@ takes, and beside it a search that has not converged is on the other side. A sol
 a periodic orbit, and their derivatives, are those of the mode only if it is told which one to take.
 """
 
+import functools as ft
 import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TYPE_CHECKING
@@ -15,7 +16,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 
-from .._numerics._kinks import evaluate, has_kinks, origins, Seen, sign_along, way_to
+from .._numerics._kinks import evaluate, has_kinks, is_partial, origins, Seen, sign_along, way_to
 from .._types import Scalar, Y
 from ._sgn import sgn
 from ._system import arrays_of, System
@@ -33,14 +34,25 @@ class Side(NamedTuple):
     way: tuple[int, ...]  # from its h to that of the switch, see `way_to`
 
 
-def sides_of(model: "SwitchedSystem", t: Scalar, y: Y) -> tuple[Side, ...]:
+class Sides(NamedTuple):
+    """All of them."""
+
+    kinks: tuple[Side, ...]
+    partial: bool  # whether beyond a surface the field may not be defined: h**1.5
+
+
+def sides_of(model: "SwitchedSystem", t: Scalar, y: Y) -> Sides | None:
     """The kinks of a model's field on surfaces of its own `sgn` switches, as the operations tell that they are there:
     of the same difference, of its negative or a multiple. None of a field with a kink within a loop."""
     own = [k for k, switch in enumerate(model.switches) if isinstance(switch, sgn) and model.parts[k] == 1]
     own = [k for k in own if not model.conditional(k)]
     args, system = _arguments(model.system, t, y, tuple(0.0 for _ in model.switches))
-    if not own or not has_kinks(lambda args: _field(system(args), *args[1:]), args):
-        return ()
+
+    def field(args: tuple) -> Y:
+        return _field(system(args), *args[1:])
+
+    if not own or not has_kinks(field, args):
+        return None
     found: list[Side] = []
 
     def both(args: Any) -> tuple[Y, list[Scalar]]:
@@ -63,15 +75,24 @@ def sides_of(model: "SwitchedSystem", t: Scalar, y: Y) -> tuple[Side, ...]:
             found.extend(Side(i, k, way) for k, way in ways if way is not None)
 
     jax.eval_shape(look, args)  # of which nothing stays in a program that is being traced
-    return tuple(found)
+    return Sides(tuple(found), is_partial(field, args)) if found else None
 
 
-def one_sided(system: System, sides: tuple[Side, ...], t: Scalar, y: Y, s: tuple[Any, ...]) -> Y:
-    """The vector field, with the signs of some kinks taken from the switches (zero where one holds)."""
-    at = {side.kink: side for side in sides}
+def one_sided(system: System, sides: Sides, t: Scalar, y: Y, s: tuple[Any, ...]) -> Y:
+    """The vector field, with the signs of some kinks taken from the switches (zero where one holds); as it is written
+    where it is not defined so."""
     args, whole = _arguments(system, t, y, s)
+    f = _told(lambda args: _field(whole(args), *args[1:]), sides, s, args)
+    if not sides.partial:
+        return f
+    good = ft.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(f)])
+    return jax.tree.map(lambda x, plain: jnp.where(good, x, plain), f, _field(system, t, y, s))
+
+
+def _told(field: Callable[[tuple], Y], sides: Sides, s: tuple[Any, ...], args: tuple) -> Y:
+    at = {side.kink: side for side in sides.kinks}
     seen: Seen = {}
-    walk, sent = evaluate(lambda args: _field(whole(args), *args[1:]), args, seen=seen), None
+    walk, sent = evaluate(field, args, seen=seen), None
     for i in itertools.count():
         try:
             _, h = walk.send(sent)

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import nsjax
 from nsjax.system._mode import ModeState
 from nsjax.system._model import SwitchedSystem
-from nsjax.system._one_sided import Side
+from nsjax.system._one_sided import Side, Sides
 
 
 class Belt(nsjax.System):
@@ -104,25 +104,28 @@ def model_of(system, smooth=True):
 
 
 @pytest.mark.parametrize(
-    "system, sides",
+    "system, way",
     [
-        (Same(), (Side(0, 0, ()),)),
-        (Turned(), (Side(0, 0, (-1,)),)),
-        (Negative(), (Side(0, 0, (-1,)),)),
-        (Greater(), (Side(0, 0, ()),)),
-        (Scaled(), (Side(0, 0, (0, -1)),)),
-        (Twice(), (Side(0, 0, (0, 1, 1, -1)),)),
-        (Elsewhere(), (Side(0, 0, ()),)),
-        (Alike(), ()),
-        (Looped(), ()),
-        (Written(), ()),
+        (Same(), ()),
+        (Turned(), (-1,)),
+        (Negative(), (-1,)),
+        (Greater(), ()),
+        (Scaled(), (0, -1)),
+        (Twice(), (0, 1, 1, -1)),
+        (Elsewhere(), ()),
+        (Alike(), None),
+        (Looped(), None),
+        (Written(), None),
     ],
     ids=lambda x: type(x).__name__,
 )
-def test_told_by_the_operations(system, sides):
-    assert model_of(system).sides == sides
-    assert not model_of(system, smooth=False).sides
-    assert jax.jit(lambda v_dr: len(model_of(type(system)(v_dr=v_dr)).sides) + jnp.zeros(()))(0.3) == len(sides)
+def test_told_by_the_operations(system, way):
+    want = None if way is None else Sides((Side(0, 0, way),), partial=False)
+    assert model_of(system).sides == want
+    assert model_of(system, smooth=False).sides is None
+    seen = []
+    jax.eval_shape(lambda v_dr: seen.append(model_of(type(system)(v_dr=v_dr)).sides), 0.3)
+    assert seen == [want]
 
 
 @pytest.mark.parametrize("system", SMOOTH, ids=lambda x: type(x).__name__)
@@ -146,6 +149,33 @@ def test_flow_of_a_mode_is_smooth_beyond_its_surface(system, mode):
 
         for got, want in zip(numbers(type(system)), numbers(Written)):
             np.testing.assert_allclose(got, want, atol=1e-14)
+
+
+class Ball(nsjax.System):
+    """On a floor as of Hertz."""
+
+    n: float = 1.5
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, 100.0 * jnp.maximum(-y.x, 0.0) ** self.n - 1.0 + 0.0 * s.floor)
+
+    @nsjax.sgn
+    def floor(self, t, y):
+        return -y.x
+
+
+def test_a_power_is_left_as_it_is_where_it_has_no_value():
+    model = model_of(Ball())
+    assert model.sides == Sides((Side(0, 0, ()),), partial=True)
+    state = ModeState.of([jnp.asarray(1, jnp.int32)], [None])
+
+    def pull(x):
+        return model.flow(jnp.zeros(()), Motion(x, 0.0 * x), state).v
+
+    for x, want, slope in ((-0.04, -0.2, -30.0), (0.0, -1.0, 0.0), (1e-17, -1.0, 0.0)):
+        np.testing.assert_allclose(pull(x), want, atol=1e-14)
+        np.testing.assert_allclose(jax.jvp(pull, (x,), (1.0,))[1], slope, atol=1e-12)
+    np.testing.assert_allclose(pull(0.5), -1.0, atol=1e-14)
 
 
 def period_of(v_dr, k_3=0.3, delta=3.0):
