@@ -5,6 +5,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from branches import continue_orbit, orbit_of
 from models import Motion
 from scipy.integrate import solve_ivp
 
@@ -196,8 +197,8 @@ def period_of(v_dr, k_3=0.3, delta=3.0):
 def test_a_branch_with_falling_friction():
     """It ended after a millionth of the interval, as Newton's method came to both sides of the surface."""
     system = Turned()
-    orbit = nsjax.find_orbit(system, Motion(1.0, 0.2), period=12.0)
-    branch = nsjax.continue_orbit(system, orbit, "v_dr", (0.19, 0.21), max_branches=1, max_step=0.1)
+    orbit = orbit_of(system, Motion(1.0, 0.2), period=12.0)
+    branch = continue_orbit(system, orbit, "v_dr", (0.19, 0.21), max_branches=1, max_step=0.1)
     assert len(branch) < 30 and np.all(branch.stable)
     np.testing.assert_allclose([branch.values[0], branch.values[-1]], [0.19, 0.21], atol=1e-12)
     np.testing.assert_allclose(branch.multipliers, np.tile([1.0, 0.0], (len(branch), 1)), atol=1e-8)
