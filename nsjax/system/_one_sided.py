@@ -79,8 +79,8 @@ def sides_of(model: "SwitchedSystem", t: Scalar, y: Y) -> Sides | None:
 
 
 def one_sided(system: System, sides: Sides, t: Scalar, y: Y, s: tuple[Any, ...]) -> Y:
-    """The vector field, with the signs of some kinks taken from the switches (zero where one holds); as it is written
-    where it is not defined so."""
+    """The vector field, with the signs of some kinks taken from the switches (zero for the value 0, about which the
+    field is linearised where one holds); as it is written where it is not defined so."""
     args, whole = _arguments(system, t, y, s)
     f = _told(lambda args: _field(whole(args), *args[1:]), sides, s, args)
     if not sides.partial:
