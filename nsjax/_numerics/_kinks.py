@@ -21,13 +21,14 @@ from ._series import _CALLS
 _KINKS: dict[str, Callable[..., Any]] = {"abs": jnp.abs, "max": jnp.maximum, "min": jnp.minimum, "clamp": lax.clamp}
 _IDLE = {"max": -np.inf, "min": np.inf}  # bounds that never act
 _PARTIAL = ("pow", "sqrt", "rsqrt", "log", "log1p", "acos", "asin", "acosh", "atanh")
+_INLINED = ("jit", "pjit", "closed_call")
 _SMOOTH = ("hypot", "logaddexp", "logaddexp2")  # functions of JAX that are smooth, but written with kinks
 
 # One evaluation serves to list kinks, to give the h of one of them (it goes no further), and to put signs in. So it is
 # a generator: it yields the kind and h of each kink, and is sent the sign of h, or None to leave it as it is.
 Walk = Generator[tuple[str, Array], Array | None, Any]
-Seen = dict[Any, Any]
-"""Values by the operation and the arguments they came from."""
+Seen = dict[Any, tuple[Any, tuple, Any]]
+"""By an operation's name and arguments: its result, the arguments, its parameters."""
 
 
 def _has_kink(e: Any) -> bool:
@@ -37,12 +38,18 @@ def _has_kink(e: Any) -> bool:
     return any(_has_kink(e) for jaxpr in inner for e in jaxpr.eqns)
 
 
+def _is_call(e: Any) -> bool:
+    """Whether it is a function that is only written apart, as `jnp.flip` is."""
+    inner = [jaxpr.debug_info.func_name for jaxpr in jex.jaxprs_in_params(e.params)]
+    return e.primitive.name in _INLINED and len(inner) == 1 and inner[0] not in _SMOOTH
+
+
 def _is_known(x: Any) -> bool:
     """Whether it is a number written in the program: these are kept as NumPy arrays."""
     return isinstance(x, np.ndarray)
 
 
-def _once(seen: Seen, name: Any, fn: Callable[..., Any], *x: Any) -> Any:
+def _once(seen: Seen, name: Any, fn: Callable[..., Any], *x: Any, params: Any = None) -> Any:
     """`fn(*x)`, kept with x, so that equal values are one object: kinks on the same surface have one switch."""
     key = (name, *[(v.dtype.str, v.shape, v.tobytes()) if _is_known(v) else id(v) for v in x])
     if key not in seen:
@@ -50,7 +57,7 @@ def _once(seen: Seen, name: Any, fn: Callable[..., Any], *x: Any) -> Any:
         with jax.ensure_compile_time_eval() if known else contextlib.nullcontext():
             out = fn(*x)
         number = isinstance(out, jax.Array) and jnp.issubdtype(out.dtype, jnp.number)
-        seen[key] = np.asarray(out) if known and number else out, x
+        seen[key] = np.asarray(out) if known and number else out, x, params
     return seen[key][0]
 
 
@@ -63,9 +70,9 @@ def _walk(jaxpr: Any, values: list[Any], seen: Seen) -> Walk:
 
     for e in jaxpr.eqns:
         x, name = [read(v) for v in e.invars], e.primitive.name
-        if not _has_kink(e):
+        if not (_has_kink(e) or _is_call(e)):
             bind = ft.partial(e.primitive.bind, **e.primitive.get_bind_params(e.params))
-            out = bind(*x) if e.effects else _once(seen, (name, str(e.params)), bind, *x)
+            out = bind(*x) if e.effects else _once(seen, (name, str(e.params)), bind, *x, params=e.params)
             out = out if e.primitive.multiple_results else [out]
         elif name in _CALLS:
             (inner,) = (p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr))
@@ -96,8 +103,8 @@ def _kink(kind: str, x: list[Any], seen: Seen) -> Walk:
     alone = len(x) == 1 or bound is not None and bound.ndim == 0 and bound == 0
     h = x[0] if alone else _once(seen, ("sub", "{}"), jnp.subtract, *x)  # as the program's own a - b is known
     if ("switch", id(h)) not in seen:
-        seen["switch", id(h)] = (yield kind, h), h
-    s, _ = seen["switch", id(h)]
+        seen["switch", id(h)] = (yield kind, h), (h,), None
+    s, _, _ = seen["switch", id(h)]
     if s is None:
         return _once(seen, kind, _KINKS[kind], *x)
     size = _once(seen, "size", jnp.multiply, h, s)
@@ -127,38 +134,3 @@ def is_partial(fn: Callable[..., Any], *args: Any) -> bool:
         return any(e.primitive.name in _PARTIAL for e in jaxpr.eqns) or any(map(within, inner))
 
     return within(jax.make_jaxpr(fn)(*args).jaxpr)
-
-
-_NEGATIVE = -1
-_LEADING = {"neg": {_NEGATIVE: 0}, "mul": {0: 0, 1: 1}, "div": {0: 0}}  # operations: the steps, and to which argument
-_NOWHERE = "", (), ()
-
-
-def origins(seen: Seen) -> dict[int, tuple[str, tuple, tuple]]:
-    """Of each number: the operation that it came from, by what its arguments are told apart, and these."""
-    return {id(out): (name[0], tuple(parts), x) for (name, *parts), (out, x) in seen.items()}
-
-
-def way_to(h: Any, other: Any, origin: dict[int, Any]) -> tuple[int, ...] | None:
-    """How a number was made of another one: a product or quotient is told by the place of the factor that leads there,
-    a negative or the opposite difference by -1. None if it was not."""
-    if h is other:
-        return ()
-    name, parts, x = origin.get(id(h), _NOWHERE)
-    if name == "sub" and origin.get(id(other), _NOWHERE)[:2] == ("sub", parts[::-1]):
-        return (_NEGATIVE,)
-    for step, place in _LEADING.get(name, {}).items():
-        rest = way_to(x[place], other, origin)
-        if rest is not None:
-            return step, *rest
-    return None
-
-
-def sign_along(h: Any, way: tuple[int, ...], origin: dict[int, Any]) -> Any:
-    """The sign of a number, relative to the one to which that way leads."""
-    sign: Any = 1
-    for step in way:
-        _, _, x = origin[id(h)]
-        sign = -sign if step == _NEGATIVE else sign * jnp.sign(x[1 - step])
-        h = x[max(step, 0)]
-    return sign

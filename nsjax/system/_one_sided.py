@@ -15,8 +15,10 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+from jaxtyping import Array
 
-from .._numerics._kinks import evaluate, has_kinks, is_partial, origins, Seen, sign_along, way_to
+from .._numerics._kinks import evaluate, has_kinks, is_partial, Seen
+from .._numerics._origins import Entry, Origins, Way
 from .._types import Scalar, Y
 from ._sgn import sgn
 from ._system import arrays_of, System
@@ -30,8 +32,11 @@ class Side(NamedTuple):
     """A kink on the surface of a switch."""
 
     kink: int  # its number, as they are met in the program of the field
+    at: int  # which entry of it, where it is one of several numbers
     switch: int
-    way: tuple[int, ...]  # from its h to that of the switch, see `way_to`
+    way: Way  # from its h to that of the switch, but for factors that are written there
+    sign: int  # of these
+    idle: bool  # whether the switch may be off, with value 0 wherever its h is
 
 
 class Sides(NamedTuple):
@@ -43,9 +48,9 @@ class Sides(NamedTuple):
 
 def sides_of(model: "SwitchedSystem", t: Scalar, y: Y) -> Sides | None:
     """The kinks of a model's field on surfaces of its own `sgn` switches, as the operations tell that they are there:
-    of the same difference, of its negative or a multiple. None of a field with a kink within a loop."""
+    of the same difference, of its negative or a multiple, among several or alone. None of a field with a kink within a
+    loop."""
     own = [k for k, switch in enumerate(model.switches) if isinstance(switch, sgn) and model.parts[k] == 1]
-    own = [k for k in own if not model.conditional(k)]
     args, system = _arguments(model.system, t, y, tuple(0.0 for _ in model.switches))
 
     def field(args: tuple) -> Y:
@@ -69,10 +74,13 @@ def sides_of(model: "SwitchedSystem", t: Scalar, y: Y) -> Sides | None:
             surfaces = end.value[1]
         except ValueError:
             return
-        origin = origins(seen)
+        origins = Origins(seen)
+        cores = [origins.core(Entry(level)) for level in surfaces]
         for i, h in enumerate(kinks):
-            ways = ((k, way_to(h, level, origin)) for k, level in zip(own, surfaces))
-            found.extend(Side(i, k, way) for k, way in ways if way is not None)
+            for at, (k, (core, sign)) in itertools.product(range(h.size), zip(own, cores)):
+                way = origins.way(Entry(h, at), core)
+                if way is not None:
+                    found.append(Side(i, at, k, way, sign, model.conditional(k)))
 
     jax.eval_shape(look, args)  # of which nothing stays in a program that is being traced
     return Sides(tuple(found), is_partial(field, args)) if found else None
@@ -90,7 +98,7 @@ def one_sided(system: System, sides: Sides, t: Scalar, y: Y, s: tuple[Any, ...])
 
 
 def _told(field: Callable[[tuple], Y], sides: Sides, s: tuple[Any, ...], args: tuple) -> Y:
-    at = {side.kink: side for side in sides.kinks}
+    at = {(side.kink, side.at): side for side in sides.kinks}
     seen: Seen = {}
     walk, sent = evaluate(field, args, seen=seen), None
     for i in itertools.count():
@@ -98,9 +106,18 @@ def _told(field: Callable[[tuple], Y], sides: Sides, s: tuple[Any, ...], args: t
             _, h = walk.send(sent)
         except StopIteration as end:
             return end.value
-        sent = None
-        if i in at:
-            sent = lax.stop_gradient(sign_along(h, at[i].way, origins(seen)) * jnp.sign(s[at[i].switch]))
+        here = [at.get((i, n)) for n in range(h.size)]
+        sent = lax.stop_gradient(_signs(h, here, s, Origins(seen))) if any(here) else None
+
+
+def _signs(h: Array, sides: list[Side | None], s: tuple[Any, ...], origins: Origins) -> Array:
+    """Of the entries of h; without a switch as JAX differentiates |h|."""
+    signs = list(jnp.ravel(jnp.where(h < 0, -1, 1).astype(h.dtype)))
+    for n, side in enumerate(sides):
+        if side is not None:
+            told = side.sign * origins.sign(Entry(h, n), side.way) * jnp.sign(s[side.switch])
+            signs[n] = jnp.where(s[side.switch] == 0, signs[n], told) if side.idle else told
+    return jnp.stack(signs).reshape(h.shape)
 
 
 def _field(system: System, t: Scalar, y: Y, s: tuple[Any, ...]) -> Y:

@@ -10,7 +10,7 @@ from models import Motion
 from scipy.integrate import solve_ivp
 
 import nsjax
-from nsjax.system._mode import ModeState
+from nsjax.system._mode import ModeState, OFF
 from nsjax.system._model import SwitchedSystem
 from nsjax.system._one_sided import Side, Sides
 
@@ -121,7 +121,7 @@ def model_of(system, smooth=True):
     ids=lambda x: type(x).__name__,
 )
 def test_told_by_the_operations(system, way):
-    want = None if way is None else Sides((Side(0, 0, way),), partial=False)
+    want = None if way is None else Sides((Side(0, 0, 0, way, sign=1, idle=False),), partial=False)
     assert model_of(system).sides == want
     assert model_of(system, smooth=False).sides is None
     seen = []
@@ -152,6 +152,90 @@ def test_flow_of_a_mode_is_smooth_beyond_its_surface(system, mode):
             np.testing.assert_allclose(got, want, atol=1e-14)
 
 
+class Blocks(nsjax.System):
+    """Two on a belt, coupled by springs, with velocities in one array; a third number there is on no surface."""
+
+    v_dr: float = 0.2
+    delta: float = 3.0
+
+    def sizes(self, v, s):
+        return jnp.abs(jnp.flip(v) - self.v_dr)[::-1]
+
+    def vector_field(self, t, y, s):
+        friction = jnp.stack([s.first, s.second, 1.0]) / (1 + self.delta * self.sizes(y.v, s))
+        return Motion(y.v, -jnp.array([[2.0, -1.0, 0.0], [-1.0, 2.0, 0.0], [0.0, 0.0, 1.0]]) @ y.x + friction)
+
+    @nsjax.sgn
+    def first(self, t, y):
+        return self.v_dr - y.v[0]
+
+    @nsjax.sgn
+    def second(self, t, y):
+        return -2 * (y.v[1] - self.v_dr) / 3
+
+
+class BlocksWritten(Blocks):
+    def sizes(self, v, s):
+        h = self.v_dr - v
+        return jnp.stack([h[0] * s.first, h[1] * s.second, jnp.abs(v[2] - self.v_dr)])
+
+
+@pytest.mark.parametrize("mode", [(1, 1), (1, -1), (-1, 1)])
+def test_kinks_that_are_entries_of_an_array(mode):
+    y = Motion(jnp.array([0.4, -0.3, 0.1]), jnp.array([0.2, 0.2, 0.25]))
+    zero = jnp.zeros(())
+    sides = [SwitchedSystem.forwards(kind(), zero, y, True).sides for kind in (Blocks, BlocksWritten)]
+    assert sides[1] is None and [(side.at, side.switch) for side in sides[0].kinks] == [(1, 1), (2, 0)]
+    state = ModeState.of(jnp.asarray(mode, jnp.int32), [None, None])
+    for v in ([0.2, 0.2, 0.3], [0.25, 0.1, 0.1], [0.1, 0.25, 0.2 + 1e-17]):
+
+        def numbers(kind, v=v):
+            def of(z):
+                system = kind(v_dr=z[0], delta=z[1])
+                f = SwitchedSystem.forwards(system, zero, y, True).flow(zero, Motion(y.x, z[2:]), state)
+                return jnp.concatenate([f.x, f.v])
+
+            z = jnp.asarray([0.2, 3.0, *v])
+            return of(z), jax.jacfwd(of)(z)
+
+        for got, want in zip(numbers(Blocks), numbers(BlocksWritten)):
+            np.testing.assert_allclose(got, want, atol=1e-14)
+
+
+class Rubbing(nsjax.System):
+    """A wheel that drives a mass while they touch, with friction that falls; air slows it by its relative velocity,
+    touching or not."""
+
+    def vector_field(self, t, y, s):
+        w = jnp.abs(y.v - 0.2)
+        return Motion(y.v, -y.x + s.rub / (1 + 3 * w) - w)
+
+    @nsjax.sgn
+    def touching(self, t, y):
+        return -y.x
+
+    @nsjax.sgn
+    def rub(self, t, y):
+        return 0.2 - y.v
+
+    rub = rub.while_("touching")
+
+
+@pytest.mark.parametrize("touching, rub, v, want", [
+    (1, 1, 0.3, 1 / 0.7 + 0.1),  # beyond its surface: -|h| = h
+    (1, -1, 0.1, -1 / 0.7 + 0.1),
+    (1, 1, 0.1, 1 / 1.3 - 0.1),
+    (-1, OFF, 0.3, -0.1),
+    (-1, OFF, 0.1, -0.1),
+])  # fmt: skip
+def test_a_switch_that_may_be_off_has_no_sign_then(touching, rub, v, want):
+    model = model_of(Rubbing())
+    assert [side.idle for side in model.sides.kinks] == [True]
+    state = ModeState.of(jnp.asarray([touching, rub], jnp.int32), [None, None])
+    f = model.flow(jnp.zeros(()), Motion(jnp.asarray(0.5), jnp.asarray(v)), state)
+    np.testing.assert_allclose(f.v, want - 0.5, atol=1e-14)
+
+
 class Ball(nsjax.System):
     """On a floor as of Hertz."""
 
@@ -167,7 +251,7 @@ class Ball(nsjax.System):
 
 def test_a_power_is_left_as_it_is_where_it_has_no_value():
     model = model_of(Ball())
-    assert model.sides == Sides((Side(0, 0, ()),), partial=True)
+    assert model.sides == Sides((Side(0, 0, 0, (-1,), sign=-1, idle=False),), partial=True)
     state = ModeState.of([jnp.asarray(1, jnp.int32)], [None])
 
     def pull(x):
