@@ -293,3 +293,45 @@ def test_a_branch_with_falling_friction(tmp_path):
     again = nsjax.OrbitContinuation.load(tmp_path / "growth", system, **QUICK)
     sides = [one._explorer.tracer.curve.model.sides for one in (growth, again)]
     assert sides[0] == sides[1] == model_of(system).sides
+
+
+@pytest.mark.slow
+def test_a_point_without_derivatives_is_none():
+    """With the kink in a loop the derivatives are not numbers on an orbit here and there. One was called unstable."""
+    system = Looped()
+    orbit = orbit_of(system, Motion(1.0, 0.2), period=12.0)
+    branch = continue_orbit(system, orbit, "v_dr", (0.15, 0.25), max_branches=1, max_step=0.1)
+    assert np.all(np.isfinite(branch.multipliers)) and np.all(branch.stable)
+    np.testing.assert_allclose(branch.values[-1], 0.25, atol=1e-12)
+
+
+class Pair(nsjax.System):
+    """Two coupled blocks on a belt, with velocities in one array."""
+
+    v_dr: float = 0.2
+    delta: float = 3.0
+
+    def vector_field(self, t, y, s):
+        friction = jnp.stack([s.first, 1.3 * s.second]) / (1 + self.delta * jnp.abs(y.v - self.v_dr))
+        return Motion(y.v, friction - jnp.array([[2.0, -1.0], [-1.0, 2.2]]) @ y.x)
+
+    @nsjax.sgn
+    def first(self, t, y):
+        return self.v_dr - y.v[0]
+
+    @nsjax.sgn
+    def second(self, t, y):
+        return self.v_dr - y.v[1]
+
+
+@pytest.mark.slow
+def test_a_branch_of_two_blocks():
+    """Next to its first orbit none was found."""
+    system = Pair()
+    rest = Motion(jnp.array([1.0, 1.0]), jnp.array([0.2, 0.2]))
+    orbit = nsjax.find_orbit(system, nsjax.solve(system, 0.0, 150.0, rest, max_steps=100_000).y1)
+    branch = continue_orbit(system, orbit, "v_dr", (0.195, 0.2), max_branches=1, max_step=0.1)
+    other = nsjax.find_orbit(Pair(v_dr=branch.values[0]), branch.orbit(0).y0)
+    np.testing.assert_allclose(branch.values[0], 0.195, atol=1e-12)
+    np.testing.assert_allclose(branch.periods[0], other.period, rtol=1e-9)
+    np.testing.assert_allclose(branch.multipliers[0], other.multipliers, atol=1e-7)

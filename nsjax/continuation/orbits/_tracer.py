@@ -66,6 +66,12 @@ def spot_of(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary) -> Or
     return OrbitPoint(look, itinerary, look.multipliers, bool(look.stable), look.monodromy)
 
 
+def found_out(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary) -> OrbitPoint | None:
+    """None if there is no orbit, or none of which it is known whether it is stable: without derivatives."""
+    spot = spot_of(curve, look, itinerary) if bool(look.good) else None
+    return None if spot is None or np.isnan(spot.monodromy).any() else spot
+
+
 def midpoint(curve: OrbitCurve, spot: OrbitPoint, rows: Iterable[int]) -> tuple[float, np.ndarray, np.ndarray]:
     """Time, state and mode in the middle of the longest of some segments, if possible one that no surface holds: beside
     it orbits are near each other, as they need not be beside an event or where static friction holds."""
@@ -90,7 +96,7 @@ class OrbitTracer(AbstractTracer[OrbitPoint]):
 
     def at(self, spot: OrbitPoint, s: float, guess: Any = None) -> OrbitPoint | None:
         found = correct(self.curve, spot.itinerary, Plane(spot.look.u, spot.look.tangent, s), guess)
-        return spot_of(self.curve, found, spot.itinerary) if bool(found.good) else None
+        return found_out(self.curve, found, spot.itinerary)
 
     def between(self, a: OrbitPoint, b: OrbitPoint, value: float) -> OrbitPoint | None:
         """The point between two others at which the parameter has this value."""
@@ -109,7 +115,7 @@ class OrbitTracer(AbstractTracer[OrbitPoint]):
         """The orbit of an itinerary next to a guess, at the same parameter (or on another plane)."""
         border = np.eye(len(guess))[-1] if border is None else border
         found = correct(self.curve, itinerary, Plane(guess, border))
-        return spot_of(self.curve, found, itinerary) if bool(found.good) else None
+        return found_out(self.curve, found, itinerary)
 
     def passes(self, zero: Zero) -> bool:
         return zero.test.kind in PASSED
@@ -309,7 +315,8 @@ class OrbitTracer(AbstractTracer[OrbitPoint]):
         if found is None:
             return None
         look = correct(self.curve, spot.itinerary, Plane(place, spot.look.tangent), newton=False)
-        return Zero(s, test, spot_of(self.curve, look, spot.itinerary))
+        point = spot_of(self.curve, look, spot.itinerary)
+        return None if test.kind in ("low", "high") and np.isnan(point.monodromy).any() else Zero(s, test, point)
 
 
 def alike(a: OrbitPoint, b: OrbitPoint, curve: OrbitCurve, tolerance: float) -> bool:
