@@ -6,7 +6,8 @@ One branch by `continue_orbit` (point by point, from Python) and by `continue_or
 at once by `continue_orbits`, for x_c = linspace(0.99, 1.01); beside AUTO-07p where it is installed, on meshes whose
 errors are about 1e-12. Error: a state of each orbit, against matrix exponentials, of all points of the branch with
 x_c = 1; AUTO's are those at the events. Seconds are of the processor: AUTO runs on one thread, XLA on as many as it
-likes.
+likes. Last a model that is not affine, whose segments are steps of a solver: a mass on a belt with falling friction and
+a spring that hardens, over v_dr in (0.15, 0.25); error: the period, against scipy.
 """
 
 import argparse
@@ -19,8 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import peers_auto
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from sweep import machine
+from systems import Falling
 
 import nsjax
 from nsjax.gallery import Motion, Trilinear
@@ -29,6 +32,9 @@ from nsjax.gallery import Motion, Trilinear
 OMEGA = (1.15, 1.25)
 # Whole orbits, as here; AUTO's user may know that half is enough.
 MESHES = ((4, 5, 5), (4, 10, 4), (2, 3, 6))  # pieces, NTST, NCOL
+
+
+V_DR = (0.15, 0.25)
 
 
 class Row(NamedTuple):
@@ -62,22 +68,50 @@ def error_of(omega: np.ndarray, t: np.ndarray, x: np.ndarray, v: np.ndarray) -> 
     return float(max(np.abs(x - sign * y[:, 0]).max(), np.abs(v - sign * y[:, 1]).max()))
 
 
-def one_by_one(orbit: nsjax.Orbit, max_step: float, repeats: int) -> Row:
+def period_of(v_dr: float) -> float:
+    """Of `Falling`: it sticks until the spring is as strong as friction, and slips until it is as fast as the belt."""
+    one = Falling()
+    x = next(float(r.real) for r in np.roots([one.k_3, 0, 1, -1]) if abs(r.imag) < 1e-12)
+
+    def slip(t: float, y: np.ndarray) -> list[float]:
+        return [y[1], -y[0] - one.k_3 * y[0] ** 3 + 1 / (1 + one.delta * (v_dr - y[1]))]
+
+    def caught(t: float, y: np.ndarray) -> float:
+        return y[1] - v_dr if t > 0.5 else -1.0
+
+    caught.terminal = True  # type: ignore[attr-defined]
+    end = solve_ivp(slip, (0, 50), [x, v_dr], "DOP853", rtol=1e-12, atol=1e-12, events=caught)
+    return end.t[-1] + (x - end.y[0, -1]) / v_dr
+
+
+def looks(orbit: nsjax.Orbit, parameter: str, interval: tuple, max_step: float, repeats: int) -> tuple[list, Any, Any]:
+    """What is seen at each point of a branch, one after the other; seconds of the first time and of the others."""
     seconds, first = [], 0.0
     points: list[Any] = []
     for i in range(repeats + 1):
-        growth = nsjax.OrbitContinuation(orbit.system, orbit, "omega", OMEGA, max_step=max_step)
+        growth = nsjax.OrbitContinuation(orbit.system, orbit, parameter, interval, max_step=max_step, max_branches=1)
         wall, start = time.perf_counter(), time.process_time()
         points = list(growth)
         if i == 0:
             first = time.perf_counter() - wall
         else:
             seconds.append(time.process_time() - start)
-    look = [point.look for point in points]
+    median = float(np.median(seconds))
+    return [point.look for point in points], first - median, median
+
+
+def one_by_one(orbit: nsjax.Orbit, max_step: float, repeats: int) -> Row:
+    look, first, median = looks(orbit, "omega", OMEGA, max_step, repeats)
     x = np.stack([one.x[0] for one in look])
     error = error_of(np.array([float(one.parameter) for one in look]), np.array([one.begin[0] for one in look]), *x.T)
-    median = float(np.median(seconds))
-    return Row("continue_orbit", 1, len(points), first - median, median, len(points) / median, error)
+    return Row("continue_orbit", 1, len(look), first, median, len(look) / median, error)
+
+
+def by_steps(repeats: int) -> Row:
+    orbit = nsjax.find_orbit(Falling(), Motion(1.0, 0.2), solver=diffrax.Dopri8())
+    look, first, median = looks(orbit, "v_dr", V_DR, 0.1, repeats)
+    error = max(abs(float(one.period) - period_of(float(one.parameter))) for one in look)
+    return Row("continue_orbit, not affine", 1, len(look), first, median, len(look) / median, error)
 
 
 def at_once(orbits: nsjax.Orbit, max_step: float, points: int, repeats: int) -> Row:
@@ -120,6 +154,7 @@ def main() -> None:
     rows.append(at_once(one, options.max_step, 2000, options.repeats))
     rows.append(at_once(many, 10 * options.max_step, 200, options.repeats))
     rows += [by_auto(*mesh) for mesh in MESHES] if peers_auto.directory() else []
+    rows.append(by_steps(options.repeats))
     print(
         "| code | branches | points | compile [s] | processor [s] | points/s | error |\n|---|---|---|---|---|---|---|"
     )

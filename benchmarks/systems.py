@@ -53,6 +53,22 @@ class Hitting(Rubbing):
         return 0.8
 
 
+class Falling(nsjax.System):
+    """A mass on a belt whose friction falls with the sliding velocity, and on a spring that hardens."""
+
+    v_dr: float = 0.2
+    k_3: float = 0.3
+    delta: float = 3.0
+
+    def vector_field(self, t, y, s):
+        friction = s.belt / (1 + self.delta * jnp.abs(y.v - self.v_dr))
+        return Motion(y.v, -y.x - self.k_3 * y.x**3 + friction)
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return self.v_dr - y.v
+
+
 class ThreeSurfaces(nsjax.System):
     """A forced oscillator with three switches, one of which has a surface with a corner."""
 
