@@ -89,8 +89,9 @@ def looks(orbit: nsjax.Orbit, parameter: str, interval: tuple, max_step: float, 
     seconds, first = [], 0.0
     points: list[Any] = []
     for i in range(repeats + 1):
+        wall = time.perf_counter()
         growth = nsjax.OrbitContinuation(orbit.system, orbit, parameter, interval, max_step=max_step, max_branches=1)
-        wall, start = time.perf_counter(), time.process_time()
+        start = time.process_time()
         points = list(growth)
         if i == 0:
             first = time.perf_counter() - wall
