@@ -30,11 +30,9 @@ from nsjax.gallery import Motion, Trilinear
 
 
 OMEGA = (1.15, 1.25)
+V_DR = (0.15, 0.25)
 # Whole orbits, as here; AUTO's user may know that half is enough.
 MESHES = ((4, 5, 5), (4, 10, 4), (2, 3, 6))  # pieces, NTST, NCOL
-
-
-V_DR = (0.15, 0.25)
 
 
 class Row(NamedTuple):
