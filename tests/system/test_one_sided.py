@@ -333,5 +333,5 @@ def test_a_branch_of_two_blocks():
     branch = continue_orbit(system, orbit, "v_dr", (0.195, 0.2), max_branches=1, max_step=0.1)
     other = nsjax.find_orbit(Pair(v_dr=branch.values[0]), branch.orbit(0).y0)
     np.testing.assert_allclose(branch.values[0], 0.195, atol=1e-12)
-    np.testing.assert_allclose(branch.periods[0], other.period, rtol=1e-9)
-    np.testing.assert_allclose(branch.multipliers[0], other.multipliers, atol=1e-7)
+    np.testing.assert_allclose(branch.periods[0], other.period, rtol=1e-11)
+    np.testing.assert_allclose(branch.multipliers[0], other.multipliers, atol=1e-9)
