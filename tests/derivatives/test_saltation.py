@@ -148,7 +148,18 @@ def racket(e, a):
 
 
 # Long to compile: of impacts and of tuple-valued h others stay.
-LONG = ("(3.41)", "(3.57)", "(3.61)", "(3.32), reset", "impact", "(6.21) a", "(6.21) b", "(6.22) a", "(6.22) b")
+LONG = (
+    "(3.41)",
+    "(3.57)",
+    "(3.61)",
+    "(3.32)",
+    "(3.32), reset",
+    "impact",
+    "(6.21) a",
+    "(6.21) b",
+    "(6.22) a",
+    "(6.22) b",
+)
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=[pytest.mark.slow] * (c in LONG)) for c in CASES])

@@ -13,6 +13,7 @@ from nsjax import gallery, solve
 
 
 ADJOINTS = {"jacobian": dfx.DirectAdjoint(), "checkpoint": dfx.RecursiveCheckpointAdjoint()}
+SLOW_BY_STEPS = ["jacobian", pytest.param("checkpoint", marks=pytest.mark.slow)]
 CHEAP = dict(solver=dfx.Bosh3(), stepsize_controller=pid(1e-6), max_steps=256, max_events=16)
 
 
@@ -31,11 +32,61 @@ def forward():
     return jax.jit(jax.jacfwd(lambda p: stick_slip(p, dfx.ForwardMode())))(POINT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ADJOINTS)
-def test_reverse_is_forward(forward, adjoint):
-    """Sliding entry, static breakaway, event times."""
+def test_parameters_of_the_gallery(forward, adjoint):
     backward = jax.jit(jax.jacrev(lambda p: stick_slip(p, ADJOINTS[adjoint])))(POINT)
     np.testing.assert_allclose(backward, forward, rtol=1e-10, atol=1e-10)
+
+
+class Learned(nsjax.System):
+    """A mass on a belt whose friction force over the relative velocity is a small network."""
+
+    law: eqx.nn.MLP
+    v_dr: float = 0.3
+    ratio: float = 1.5
+
+    def vector_field(self, t, y, s):
+        relative = y.v - self.v_dr
+        return Motion(y.v, -y.x - s.belt * jax.nn.softplus(self.law(relative**2)))
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y.v - self.v_dr
+
+    @belt.breakaway
+    def belt(self):
+        return self.ratio
+
+
+LAW, REST = eqx.partition(eqx.nn.MLP("scalar", "scalar", 2, 1, key=jax.random.key(0)), eqx.is_inexact_array)
+
+
+def learned(p, adjoint):
+    """Through slip, stick and slip again: the state at the end and the times of the events."""
+    law, x, v_dr, ratio = p
+    system = Learned(eqx.combine(law, REST), v_dr, ratio)
+    sol = solve(system, 0.0, 10.0, Motion(x, 0.0), adjoint=adjoint, **CHEAP)
+    return sol.y1.x, sol.y1.v, sol.events.t[:2]
+
+
+LEARNED = (LAW, *jnp.array([1.4, 0.3, 1.5]))
+
+
+@pytest.fixture(scope="module")
+def learned_forward():
+    return jax.jit(jax.jacfwd(lambda p: learned(p, dfx.ForwardMode())))(LEARNED)
+
+
+@pytest.mark.parametrize("adjoint", SLOW_BY_STEPS)
+def test_reverse_is_forward(learned_forward, adjoint):
+    """Sliding entry, static breakaway, event times; by initial state, parameters, and the numbers of a network, whose
+    activation is a function that comes back with the solution's system."""
+    backward = jax.jit(jax.jacrev(lambda p: learned(p, ADJOINTS[adjoint])))(LEARNED)
+    for law, *others in learned_forward:
+        assert max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(law)) > 0.01
+        assert all(np.any(np.abs(x) > 0.01) for x in others)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10), backward, learned_forward)
 
 
 class Near(nsjax.System):
@@ -74,7 +125,6 @@ def test_lanes(forward, adjoint):
     assert np.isfinite(gradient).all()
 
 
-@pytest.mark.slow
 def test_lanes_that_have_ended():
     """Pitfall 18: a lane that has ended goes on with steps of no length, whose NaN must not reach the gradient."""
 
@@ -124,35 +174,6 @@ def test_hessian():
 def test_default_says_what_to_do():
     with pytest.raises(Exception, match="DirectAdjoint.*RecursiveCheckpointAdjoint"):
         jax.grad(lambda p: stick_slip(p, dfx.ForwardMode())[0])(POINT)
-
-
-class Learned(nsjax.System):
-    """A mass on a belt whose friction force over the relative velocity is a small network."""
-
-    law: eqx.nn.MLP
-    v_dr: float = 0.3
-
-    def vector_field(self, t, y, s):
-        relative = y.v - self.v_dr
-        return Motion(y.v, -y.x - s.belt * jax.nn.softplus(self.law(relative**2)))
-
-    @nsjax.sgn
-    def belt(self, t, y):
-        return y.v - self.v_dr
-
-
-def test_a_model_that_holds_functions():
-    """The activation of a network is a function, and comes back with the solution's system."""
-    law, rest = eqx.partition(eqx.nn.MLP("scalar", "scalar", 2, 1, key=jax.random.key(0)), eqx.is_inexact_array)
-    law = jax.tree.map(lambda x: x.astype(float), law)
-
-    def end(law, adjoint):
-        return solve(Learned(eqx.combine(law, rest)), 0.0, 3.0, Motion(1.0, 0.0), adjoint=adjoint, **CHEAP).y1.x
-
-    backward = jax.jit(jax.grad(lambda law: end(law, dfx.DirectAdjoint())))(law)
-    forward = jax.jit(jax.jacfwd(lambda law: end(law, dfx.ForwardMode())))(law)
-    assert max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(forward)) > 0.01
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12), backward, forward)
 
 
 @pytest.mark.slow

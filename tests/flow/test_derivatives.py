@@ -57,7 +57,8 @@ def exact():
 
 
 @pytest.mark.parametrize(
-    "solver, order", [(dfx.Tsit5(), 5), pytest.param(dfx.Dopri5(), 5, marks=pytest.mark.slow), (dfx.Dopri8(), 8)]
+    "solver, order",
+    [*(pytest.param(solver, 5, marks=pytest.mark.slow) for solver in (dfx.Tsit5(), dfx.Dopri5())), (dfx.Dopri8(), 8)],
 )
 def test_errors_fall_with_the_tolerance(solver, order, exact):
     """State, event times and their derivatives by state and parameters after thirty events: the error falls as the
@@ -114,6 +115,7 @@ def test_times_of_start_and_end():
             p[0],
             p[1],
             Motion(1.0, 0.0),
+            solver=dfx.Tsit5(),
             stepsize_controller=pid(1e-11),
             max_steps=9000,
         )
@@ -209,7 +211,9 @@ def second(system, events):
     return jax.jit(jax.jacfwd(both, has_aux=True))
 
 
-@pytest.mark.parametrize("name", FLOWS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "crossing")) for name in FLOWS]
+)
 def test_second_derivatives_by_closed_forms(name):
     """Pitfall 20: through a crossing, the start and the end of sliding, static breakaway, an impact; and of the times of
     events. The solutions are polynomials of time, on which the solver is exact."""

@@ -43,9 +43,27 @@ class Blocks(nsjax.System):
         return State(y.v, -y.x - jnp.stack([s[f"belt{i}"] for i in range(self.n)]))
 
 
-def alone(v_dr, x, v):
-    sol = nsjax.solve(thesis("3.4", v_dr=v_dr), 0.0, 9.0, Motion(x, v), saveat=diffrax.SaveAt(ts=TS), **TIGHT)
-    return sol.ys.x, sol.events.t, sol.events.num
+def end(system, y0, tol):
+    how = dict(stepsize_controller=diffrax.PIDController(rtol=tol, atol=tol), solver=diffrax.Tsit5())
+    sol = nsjax.solve(system, 0.0, 9.0, y0, saveat=diffrax.SaveAt(ts=TS), **how)
+    return sol.ys, sol.events.t, sol.events.num, sol.margin
+
+
+def alone(v_dr, y0, tol):
+    return end(thesis("3.4", v_dr=v_dr), Motion(*y0), tol)
+
+
+def together(v_dr, y0, tol):
+    return end(Blocks(v_dr), State(*y0), tol)
+
+
+def with_slope(fn):
+    """Of the belt's velocity; both from one program."""
+    return jax.jit(lambda v, *args: jax.jvp(lambda v: fn(v, *args), (v,), (jnp.ones_like(v),)))
+
+
+EACH = with_slope(jax.vmap(alone, (None, 1, None)))
+MANY = with_slope(together)
 
 
 def events_of(times, num):
@@ -55,37 +73,31 @@ def events_of(times, num):
 @pytest.fixture(scope="module")
 def singles():
     """x of each at `TS`, its derivative by the belt's velocity, and all events."""
-    each = jax.jit(jax.vmap(alone, (None, 0, 0)))
-    xs, times, num = each(0.2, *STARTS)
-    slope = jax.jit(jax.jacfwd(lambda v: each(v, *STARTS)[0]))(0.2)
-    return xs, slope, np.sort(np.concatenate([events_of(t, n) for t, n in zip(times, num)]))
+    (ys, times, num, _), (slopes, *_) = EACH(0.2, STARTS, 1e-11)
+    return ys.x, slopes.x, np.sort(np.concatenate([events_of(t, n) for t, n in zip(times, num)]))
 
 
-def check(singles, of_v, xs):
+def check(singles, found, xs):
     want, slope, times = singles
-    (found, (events, num)), moved = jax.jit(lambda v: (of_v(v), jax.jacfwd(lambda v: of_v(v)[0])(v)))(0.2)
-    np.testing.assert_allclose(xs(found), want, atol=1e-8)
+    (ys, events, num, _), (slopes, *_) = found
+    np.testing.assert_allclose(xs(ys), want, atol=1e-8)
     np.testing.assert_allclose(events_of(events, num), times, atol=1e-8)
-    np.testing.assert_allclose(xs(moved), slope, atol=1e-6)
+    np.testing.assert_allclose(xs(slopes), slope, atol=1e-6)
 
 
 def test_as_each_alone(singles):
-    def of_v(v):
-        sol = nsjax.solve(Blocks(v), 0.0, 9.0, State(*STARTS), saveat=diffrax.SaveAt(ts=TS), **TIGHT)
-        return sol.ys.x, (sol.events.t, sol.events.num)
-
-    check(singles, of_v, lambda x: x.T)
+    check(singles, MANY(0.2, STARTS, 1e-11), lambda ys: ys.x.T)
 
 
 def test_a_belt_that_is_all_but_met():
     """One block comes as near as 1e-4 to the velocity of the belt; the others, far from it, count for nothing."""
-    near, how = 0.2 - 1e-4, dict(stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8))
-    start = State(jnp.full(N, 1.01).at[3].set(1 + near), jnp.zeros(N))  # x = 1 + near cos t
-    many = nsjax.solve(Blocks(), 0.0, 9.0, start, **how)
-    one = nsjax.solve(thesis("3.4"), 0.0, 9.0, Motion(1 + near, 0.0), **how)
-    for sol in (many, one):
-        assert len(sol.events) == 0
-        assert float(sol.margin) == pytest.approx(1e-4 / (1e-8 * (1 + near)), rel=1e-2)
+    near = 0.2 - 1e-4
+    starts = np.stack([np.full(N, 1.01), np.zeros(N)])
+    starts[0, 3] = 1 + near  # x = 1 + near cos t
+    for found, of_it in (MANY, ...), (EACH, 3):
+        (_, _, num, margin), _ = found(0.2, starts, 1e-8)
+        assert np.all(num == 0)
+        assert float(margin[of_it]) == pytest.approx(1e-4 / (1e-8 * (1 + near)), rel=1e-2)
 
 
 @pytest.mark.slow
@@ -93,13 +105,8 @@ def test_a_scene_as_each_alone(singles):
     names = [f"x{i + 1}" for i in range(N)]
     begin = gallery.BlockChain(n=N).state(*(dict(zip(names, row)) for row in STARTS))
 
-    def of_v(v):
-        chain = gallery.BlockChain(n=N, k_c=0.0, v_dr=v)
-        sol = nsjax.solve(chain, 0.0, 9.0, begin, saveat=diffrax.SaveAt(ts=TS), **TIGHT)
-        assert isinstance(sol.system, gallery.BlockChain)
-        return sol.ys.q, (sol.events.t, sol.events.num)
-
-    check(singles, of_v, lambda q: jnp.stack(q))
+    chain = with_slope(lambda v, *how: end(gallery.BlockChain(n=N, k_c=0.0, v_dr=v), *how))
+    check(singles, chain(0.2, begin, 1e-11), lambda ys: jnp.stack(ys.q))
 
 
 @pytest.mark.slow

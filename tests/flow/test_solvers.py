@@ -42,7 +42,10 @@ def test_every_runge_kutta_solver(solver):
 
 @pytest.mark.parametrize(
     "solver, order",
-    [(dfx.Tsit5(), 5), pytest.param(dfx.Dopri5(), 5, marks=pytest.mark.slow), (dfx.Dopri8(), 8)],
+    [
+        (dfx.Tsit5(), 5),
+        *(pytest.param(s, n, marks=pytest.mark.slow) for s, n in ((dfx.Dopri5(), 5), (dfx.Dopri8(), 8))),
+    ],
 )
 def test_order_through_events_with_constant_steps(solver, order):
     """The error falls with the order of the method although events lie anywhere within the steps (pitfall 9)."""

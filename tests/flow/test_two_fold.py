@@ -134,14 +134,19 @@ def test_what_comes_behind_is_a_solution():
 @pytest.mark.parametrize("x", [0.0, 0.4])
 @pytest.mark.parametrize("kind", [pytest.param("visible-visible", marks=pytest.mark.slow), "visible-invisible"])
 def test_start_at_it_or_behind(kind, x):
-    """At the two-fold a visible side is left to, and nothing is unique; behind it a side must be chosen. (To slide from
-    the very point has no field: λ = 0/0.)"""
-    system = FOLDS[kind][0]
-    sol = solve(system, 0.0, 0.3, VerticalPlane(x, 0.0), throw=False)
+    """At the two-fold a visible side is left to, and nothing is unique; behind it a side must be chosen."""
+    sol = solve(FOLDS[kind][0], 0.0, 0.3, VerticalPlane(x, 0.0), throw=False)
     assert not sol.unique
     assert sol.result == (RESULTS.successful if x == 0 else RESULTS.repulsive_sliding)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("x", [0.0, 0.4])
+@pytest.mark.parametrize("kind", ["visible-visible", "visible-invisible"])
+def test_start_in_a_mode_that_is_chosen(kind, x):
+    """To slide from the very point has no field: λ = 0/0."""
     for mode in (0, 1):
-        sol = solve(system, 0.0, 0.3, VerticalPlane(x, 0.0), mode={"side": mode}, throw=False)
+        sol = solve(FOLDS[kind][0], 0.0, 0.3, VerticalPlane(x, 0.0), mode={"side": mode}, throw=False)
         undefined = (x, mode) == (0.0, 0)
         assert not sol.unique and sol.mode1 == mode
         assert sol.result == (RESULTS.nonfinite_field if undefined else RESULTS.successful)

@@ -161,6 +161,7 @@ def test_map_in_batches_and_nested_vmap():
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_nothing_mapped_and_only_the_end_mapped():
     """Axes on which neither the start nor the system depends."""
     t1 = jnp.asarray([10.0, 40.0, 100.0])

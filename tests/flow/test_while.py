@@ -1,5 +1,6 @@
 """Friction that is there only while its contact is closed: `sgn.while_`."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -90,16 +91,22 @@ def logged(sol):
     return np.asarray(sol.events.t[:n]), np.asarray(sol.events.switch[:n]), np.asarray(sol.events.mode_after[:n])
 
 
+@jax.jit  # one program for all
+def moved(system, t1, y0):
+    """The solution, and the derivative of its last u by c and μ."""
+
+    def last(c, mu):
+        sol = solve(dataclasses.replace(system, c=c, mu=mu), 0.0, t1, y0)
+        return sol.y1.u, sol
+
+    return jax.jacfwd(last, argnums=(0, 1), has_aux=True)(system.c, system.mu)
+
+
 def test_slip_stick_slip_and_lift_off_in_closed_form():
     """Pitfall 43: it comes to a halt, lets go where the normal force g - a t has fallen to c/μ, and flies from g/a on:
     in flight nothing rubs, and nothing sticks as its normal force vanishes."""
     g, a, c, mu, u0, t1 = 10.0, 4.0, 1.0, 0.3, 1.0, 4.0
-
-    def final(c, mu):
-        sol = solve(Block(c=c, mu=mu), 0.0, t1, Plane(0.0, 0.0, u0, 0.0))
-        return sol.y1.u, sol
-
-    slopes, sol = jax.jacfwd(final, argnums=(0, 1), has_aux=True)(jnp.asarray(c), jnp.asarray(mu))
+    slopes, sol = moved(Block(), t1, Plane(0.0, 0.0, u0, 0.0))
     times, switches, modes = logged(sol)
     halt = min(np.roots([mu * a / 2, c - mu * g, u0]).real)
     slips, lifts = (g - c / mu) / a, g / a
@@ -113,7 +120,7 @@ def test_slip_stick_slip_and_lift_off_in_closed_form():
 def test_in_flight_nothing_happens_to_it():
     """Its velocity passes zero high above the floor; on the floor it sticks at once or slides, as it lands."""
     y0 = Plane(0.0, 1.0, 0.3, 0.0)
-    sol = solve(Block(c=-1.0, a=0.0), 0.0, 1.0, y0)
+    _, sol = moved(Block(c=-1.0, a=0.0), 1.0, y0)
     (land,), switches, modes = logged(sol)
     fall = np.sqrt(2 / 10)
     u, impulse = 0.3 - fall, 0.3 * 10 * fall
@@ -122,7 +129,7 @@ def test_in_flight_nothing_happens_to_it():
     assert switches.tolist() == [0] and modes.tolist() == [[1, 0]]
     np.testing.assert_allclose(sol.y1.u, 0, atol=1e-12)
     for mu in (0.05, 0.02):  # it is stopped and slides off again; it slides on, and slower
-        slides = solve(Block(c=-1.0, a=0.0, mu=mu), 0.0, 1.0, y0)
+        _, slides = moved(Block(c=-1.0, a=0.0, mu=mu), 1.0, y0)
         assert logged(slides)[1].tolist() == [0] and slides.mode1.tolist() == [1, -1]
         landed = min(u + mu * 10 * fall, 0)
         np.testing.assert_allclose(slides.y1.u, landed + (mu * 10 - 1) * (1 - fall), rtol=1e-9)
@@ -131,7 +138,7 @@ def test_in_flight_nothing_happens_to_it():
 @pytest.mark.parametrize("lean, u", [(0.2, 0.0), (0.5, 0.2), (-0.5, -0.2)])
 def test_an_impact_without_sliding(lean, u):
     """The normal impulse P pushes the block sideways by lean · P; friction keeps it where it is, up to μ P."""
-    sol = solve(Block(c=0.0, a=0.0, e=0.5, lean=lean), 0.0, 0.5, Plane(0.0, 1.0, 0.0, 0.0))
+    _, sol = moved(Block(c=0.0, a=0.0, e=0.5, lean=lean), 0.5, Plane(0.0, 1.0, 0.0, 0.0))
     np.testing.assert_allclose(sol.y1.u, u * 1.5 * np.sqrt(20), rtol=1e-9, atol=1e-12)
     assert sol.mode1.tolist() == [0, OFF]
 

@@ -31,9 +31,7 @@ TIGHT = dict(solver=dfx.Dopri8(), stepsize_controller=dfx.PIDController(rtol=1e-
 BELT, HAND, START = TWINS["belt"]
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("support", "chain"))) for n in TWINS]
-)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n != "belt")) for n in TWINS])
 def test_a_scene_moves_as_the_model_by_hand(name):
     scene, hand, y = TWINS[name]
     start = jax.tree.unflatten(jax.tree.structure(scene.state()), jax.tree.leaves(y))

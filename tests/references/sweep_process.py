@@ -2,6 +2,7 @@
 
 work FOLDER LANES   computes what is missing, and prints when it begins and when it is done
 devices FOLDER      two devices: sweeps of all kinds, and in JSON what was found
+charts              two devices: a chart of attractors by one and by both
 """
 
 import hashlib
@@ -111,9 +112,6 @@ def devices(folder):
             got = transform(lambda x, k, m=m: total(x, k, m), (0, 1))(few, 0.7)
             gaps += [float(abs(np.asarray(a) - np.asarray(b)).max()) for a, b in zip(got, want)]
     found["derivatives"] = max(gaps)
-    charts = [nsjax.attractor_chart(Logistic(), OVER, Beats(0.37, 0.25), devices=n, **BEATS) for n in (None, 1, 2)]
-    found["charts"] = [digest((c.periods, c.classes, c.chaotic, c.exponents, c.ys)) for c in charts]
-    found["chart"] = sorted(set(charts[0].kinds().ravel()))
     found["errors"] = {
         "within jit": failure(lambda: jax.jit(lambda x: nsjax.sweep(jnp.sin, x, devices=2))(few)),
         "within derivatives": failure(lambda: jax.jacfwd(lambda k: nsjax.sweep(lambda x: k * x, few, devices=2))(1.0)),
@@ -121,6 +119,12 @@ def devices(folder):
         "the function's": failure(lambda: nsjax.sweep(lambda x: x + {}["mine"], few, devices=2)),
     }
     print(json.dumps(found), flush=True)
+
+
+def charts():
+    found = [nsjax.attractor_chart(Logistic(), OVER, Beats(0.37, 0.25), devices=n, **BEATS) for n in (None, 1, 2)]
+    digests = [digest((c.periods, c.classes, c.chaotic, c.exponents, c.ys)) for c in found]
+    print(json.dumps({"charts": digests, "kinds": sorted(set(found[0].kinds().ravel()))}), flush=True)
 
 
 def distributed(folder, address, number):
@@ -147,4 +151,4 @@ if __name__ == "__main__":
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     if role != "work":  # now or never
         jax.config.update("jax_num_cpu_devices", 2)
-    {"work": work, "devices": devices, "distributed": distributed}[role](*rest)
+    {"work": work, "devices": devices, "charts": charts, "distributed": distributed}[role](*rest)

@@ -41,12 +41,18 @@ def test_two_devices(tmp_path):
     assert len(found["places"]) == 6 and all(place.startswith("P('lanes',") for place in found["places"].values())
 
     assert found["derivatives"] < 1e-12
-    assert len(set(found["charts"])) == 1 and {"chaos", "period 1", "period 4"} <= set(found["chart"])
     errors = found["errors"]
     for where in ("within jit", "within derivatives"):
         assert "must be a `jax.sharding.Mesh` within `jax.jit`, `jax.vmap` and derivatives, but is 2" in errors[where]
     assert "from 1 to 2, but is 3" in errors["too many"] and "jax_num_cpu_devices" in errors["too many"]
     assert errors["the function's"] == "KeyError: 'mine'"
+
+
+@pytest.mark.slow
+def test_charts_of_two_devices():
+    out, errors = begin("charts").communicate()
+    found = json.loads(out)
+    assert len(set(found["charts"])) == 1 and {"chaos", "period 1", "period 4"} <= set(found["kinds"]), errors
 
 
 @pytest.mark.slow

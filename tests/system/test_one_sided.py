@@ -278,17 +278,27 @@ def period_of(v_dr, k_3=0.3, delta=3.0):
     return end.t[-1] + (x - end.y[0, -1]) / v_dr
 
 
-def test_a_branch_with_falling_friction(tmp_path):
+@pytest.fixture(scope="module")
+def turned():
+    return orbit_of(Turned(), Motion(1.0, 0.2), period=12.0)
+
+
+@pytest.mark.slow
+def test_a_branch_with_falling_friction(turned):
     """It ended after a millionth of the interval, as Newton's method came to both sides of the surface."""
-    system = Turned()
-    orbit = orbit_of(system, Motion(1.0, 0.2), period=12.0)
-    branch = continue_orbit(system, orbit, "v_dr", (0.19, 0.21), max_branches=1, max_step=0.1)
+    branch = continue_orbit(Turned(), turned, "v_dr", (0.19, 0.21), max_branches=1, max_step=0.1)
     assert len(branch) < 30 and np.all(branch.stable)
     np.testing.assert_allclose([branch.values[0], branch.values[-1]], [0.19, 0.21], atol=1e-12)
     np.testing.assert_allclose(branch.multipliers, np.tile([1.0, 0.0], (len(branch), 1)), atol=1e-11)
     for i in (0, -1):
         np.testing.assert_allclose(branch.periods[i], period_of(branch.values[i]), rtol=1e-11)
-    growth = nsjax.OrbitContinuation(system, orbit, "v_dr", (0.19, 0.21), **QUICK)
+
+
+@pytest.mark.slow
+def test_a_continuation_that_is_kept_knows_them(turned, tmp_path):
+    """In its equations, before it is written and when it is read."""
+    system = Turned()
+    growth = nsjax.OrbitContinuation(system, turned, "v_dr", (0.19, 0.21), **QUICK)
     growth.save(tmp_path / "growth")
     again = nsjax.OrbitContinuation.load(tmp_path / "growth", system, **QUICK)
     sides = [one._explorer.tracer.curve.model.sides for one in (growth, again)]
