@@ -10,8 +10,7 @@ import sys
 
 HERE = pathlib.Path(__file__).parent
 RUNS = (
-    ("sweep.py", "--workload", "S1", "S2", "S3", "--batch", "256", "--out", "sweep.json"),
-    ("sweep_turns.py", "--out", "sweep_turns.json"),
+    ("sweep.py", "--out", "sweep.json"),
     ("cost.py", "--out", "cost.json"),
     ("first_answer.py", "--out", "first_answer.json"),
     ("growth.py", "--out", "growth"),

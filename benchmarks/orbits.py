@@ -100,7 +100,7 @@ def main() -> None:
             orbit = search(v_dr, **how)
             return orbit.y0, orbit.period, orbit.multipliers, nsjax.is_okay(orbit.result)
 
-        program = measure(lambda p, fn=lane: nsjax.sweep(fn, p), jnp.asarray(values), repeats=args.repeats)
+        (program,) = measure([(lambda p, fn=lane: nsjax.sweep(fn, p), (jnp.asarray(values),))], args.repeats)
         _, period, _, okay = jax.tree.map(np.asarray, program.out)
         wrong = float(np.max(np.abs(period - reference.stick_slip_period(values))[okay]))
         rate = args.lanes / program.seconds

@@ -9,7 +9,6 @@ rules. One module a package says what its user must know: `peers_scipy`, `peers_
 import argparse
 import ast
 import inspect
-import statistics
 import textwrap
 import time
 from collections.abc import Callable, Sequence
@@ -23,13 +22,26 @@ import peers_scipy
 from workloads import WORKLOADS
 
 
-PEERS = ("RK45", "DOP853", "diffrax", "heyoka", "heyoka-batch")  # the first two are scipy's
+SCIPY = ("RK45", "DOP853")
+PEERS = (*SCIPY, "diffrax", "heyoka", "heyoka-batch")
 WIDTH = 8  # lanes in a batch of heyoka's: numbers in one AVX-512 register; two registers without it
+BASELINE = f"heyoka/{WIDTH}"  # of all ratios
+
+
+class Code(NamedTuple):
+    """One code at one tolerance, with its lanes."""
+
+    name: str
+    tol: float
+    values: np.ndarray
+    lines: int  # that its user writes
+    prepare: Callable[[], Callable[[], Any]]  # compiles, and returns what runs all lanes
+    unpack: Callable[[Any], np.ndarray]  # what that returns, as an array
 
 
 class Measured(NamedTuple):
-    """One code at one tolerance: median seconds for all lanes (compile apart), largest error of what is wanted, and
-    the number of lines that its user writes."""
+    """Seconds for all lanes (median, compile time apart); for a lane, their ratio to heyoka's batches at the same
+    tolerance (median of those within a round, and of the least times); errors of what is wanted; a user's lines."""
 
     workload: str
     peer: str
@@ -37,6 +49,8 @@ class Measured(NamedTuple):
     lanes: int
     seconds: float
     compile_seconds: float
+    ratio: float | None
+    ratio_of_least: float | None
     max_error: float
     median_error: float
     lines: int
@@ -55,30 +69,46 @@ def count_lines(pieces: Sequence[Any]) -> int:
     return total
 
 
-def timed(
-    workload: str,
-    name: str,
-    tol: float,
-    values: np.ndarray,
-    prepare: Callable[[], Callable[[], Any]],
-    unpack: Callable[[Any], np.ndarray],
-    *,
-    lines: int,
-    repeats: int,
-    expected: np.ndarray | None = None,
-) -> Measured:
-    """Times `prepare` (compilation), then `repeats` runs of what it returns. `expected` saves computing it again."""
+def seconds_of(run: Callable[[], Any]) -> tuple[float, Any]:
     start = time.perf_counter()
-    run = prepare()
-    compile_seconds, seconds = time.perf_counter() - start, []
-    for _ in range(repeats):
+    out = jax.block_until_ready(run())
+    return time.perf_counter() - start, out
+
+
+def in_turns(workload: str, codes: Sequence[Code], *, rounds: int, patience: float) -> list[Measured]:
+    """Each code once, compilation included, and then once in every round, in the same order, so that a machine whose
+    speed wanders does the same to all. What has taken longer than `patience` in three rounds sits the others out."""
+    runs, first, errors, expected = [], [], [], {}
+    for code in codes:
         start = time.perf_counter()
-        out = jax.block_until_ready(run())
-        seconds.append(time.perf_counter() - start)
-    expected = WORKLOADS[workload].reference(values) if expected is None else expected
-    error = np.abs(unpack(out) - expected).reshape(len(values), -1).max(1)
-    worst, median = float(error.max()), float(np.median(error))
-    return Measured(workload, name, tol, len(values), statistics.median(seconds), compile_seconds, worst, median, lines)
+        runs.append(code.prepare())
+        _, out = seconds_of(runs[-1])
+        first.append(time.perf_counter() - start)
+        if (lanes := len(code.values)) not in expected:
+            expected[lanes] = WORKLOADS[workload].reference(code.values)
+        errors.append(np.abs(code.unpack(out) - expected[lanes]).reshape(lanes, -1).max(1))
+    seconds = np.full((rounds, len(codes)), np.nan)
+    for i in range(rounds):
+        for k, run in enumerate(runs):
+            if i < 3 or np.nansum(seconds[:, k]) < patience:
+                seconds[i, k] = seconds_of(run)[0]
+    median, least = np.nanmedian(seconds, axis=0), np.nanmin(seconds, axis=0)
+    peers = {code.tol: k for k, code in enumerate(codes) if code.name == BASELINE}
+    rows = []
+    for k, (code, error) in enumerate(zip(codes, errors)):
+        ratio = of_least = None
+        if (peer := peers.get(code.tol)) is not None:
+            share = len(codes[peer].values) / len(code.values)
+            ratio = share * float(np.nanmedian(seconds[:, k] / seconds[:, peer]))
+            of_least = share * float(least[k] / least[peer])
+        compiled = max(first[k] - median[k], 0.0)
+        rows.append(
+            Measured(
+                workload, code.name, code.tol, len(code.values), float(median[k]), float(compiled), ratio, of_least,
+                float(error.max()), float(np.median(error)), code.lines,
+            )
+        )  # fmt: skip
+    return rows
 
 
 def in_chunks(name: str, batch_size: int | None) -> str:
@@ -93,46 +123,48 @@ def unpack_checked(out: tuple[Any, Any]) -> np.ndarray:
     return np.stack(found, axis=-1) if isinstance(found, tuple) else np.asarray(found)
 
 
-def measure(
-    peer: str,
-    tol: float,
-    values: np.ndarray,
-    *,
-    workload: str = "S1",
-    repeats: int = 3,
-    batch_size: int | None = None,
-    expected: np.ndarray | None = None,
-) -> Measured:
-    """Runs one of `PEERS` and compares it with the reference. `batch_size` is diffrax's."""
+def code_of(peer: str, workload: str, tol: float, values: np.ndarray, batch_size: int | None = None) -> Code:
+    """One of `PEERS`. `batch_size` is diffrax's."""
+    unpack: Callable[[Any], np.ndarray] = np.asarray
     if peer == "diffrax":
         lanes = jnp.asarray(values)
-        ensemble, name = peers_diffrax.ensemble(workload, tol=tol, batch_size=batch_size), in_chunks(peer, batch_size)
-        code = peers_diffrax.user_code(workload)
+        name, pieces, unpack = in_chunks(peer, batch_size), peers_diffrax.user_code(workload), unpack_checked
 
         def prepare() -> Callable[[], Any]:
-            compiled = ensemble.lower(lanes).compile()
+            compiled = peers_diffrax.ensemble(workload, tol=tol, batch_size=batch_size).lower(lanes).compile()
             return lambda: compiled(lanes)
 
     elif peer in ("heyoka", "heyoka-batch"):
         import peers_heyoka
 
         width = WIDTH if peer == "heyoka-batch" else 1
-        name, code = in_chunks(peer, width if width > 1 else None), peers_heyoka.user_code(workload, width=width)
+        name, pieces = in_chunks("heyoka", width if width > 1 else None), peers_heyoka.user_code(workload, width=width)
 
         def prepare() -> Callable[[], Any]:
             run = peers_heyoka.ensemble(workload, tol=tol, width=width)
             return lambda: run(values)
 
     else:
-        name, code = f"scipy {peer}", peers_scipy.user_code(workload)
+        name, pieces = f"scipy {peer}", peers_scipy.user_code(workload)
 
         def prepare() -> Callable[[], Any]:
             run = peers_scipy.ensemble(workload, method=peer, tol=tol)
             return lambda: run(values)
 
-    unpack = unpack_checked if peer == "diffrax" else np.asarray
-    lines = count_lines(code)
-    return timed(workload, name, tol, values, prepare, unpack, lines=lines, repeats=repeats, expected=expected)
+    return Code(name, tol, values, count_lines(pieces), prepare, unpack)
+
+
+HEAD = (
+    "| code | its user's lines | tolerance | seconds | over heyoka's (of the least) | compile [s] | largest error |\n"
+    "|---|---|---|---|---|---|---|"
+)
+
+
+def line(r: Measured, lanes: int) -> str:
+    """Of a table; seconds for so many lanes."""
+    over = "" if r.ratio is None else f"{r.ratio:.2f} ({r.ratio_of_least:.2f})"
+    figures = f"{r.seconds * lanes / r.lanes:.3g} | {over} | {r.compile_seconds:.1f} | {r.max_error:.1e}"
+    return f"| {r.peer} | {r.lines} | {r.tol:.0e} | {figures} |"
 
 
 def main() -> None:
@@ -142,31 +174,18 @@ def main() -> None:
     parser.add_argument("--scipy-lanes", type=int, default=8, help="lanes given to scipy, whose time is scaled up")
     parser.add_argument("--tol", type=float, nargs="+", default=[1e-6, 1e-8, 1e-10])
     parser.add_argument("--peer", nargs="+", default=PEERS, choices=PEERS)
-    parser.add_argument("--batch-size", type=int, nargs="*", default=[0, 256], help="chunks for diffrax; 0: one vmap")
+    parser.add_argument("--batch-size", type=int, default=256, help="chunks for diffrax; 0: one vmap")
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    print(
-        f"{'':<3} {'peer':<14} {'lines':>5} {'tol':>7} {f's per {options.lanes} lanes':>17} {'compile s':>10} "
-        f"{'max error':>10} {'median':>10}"
-    )
     for workload in options.workload:
+        codes = []
         for peer in options.peer:
-            lanes = options.scipy_lanes if peer in ("RK45", "DOP853") else options.lanes
-            values = WORKLOADS[workload].sweep(lanes)
-            expected = WORKLOADS[workload].reference(values)
-            for tol in options.tol:
-                for batch_size in options.batch_size if peer == "diffrax" else [0]:
-                    m = measure(
-                        peer, tol, values, workload=workload, repeats=options.repeats, batch_size=batch_size or None,
-                        expected=expected,
-                    )  # fmt: skip
-                    print(
-                        f"{workload:<3} {m.peer:<14} {m.lines:>5} {tol:>7.0e} "
-                        f"{m.seconds * options.lanes / m.lanes:>17.3f} "
-                        f"{m.compile_seconds:>10.2f} {m.max_error:>10.1e} {m.median_error:>10.1e}",
-                        flush=True,
-                    )
+            values = WORKLOADS[workload].sweep(options.scipy_lanes if peer in SCIPY else options.lanes)
+            codes += [code_of(peer, workload, tol, values, options.batch_size or None) for tol in options.tol]
+        print(f"\n### {workload}, {options.lanes} lanes\n\n{HEAD}")
+        rows = in_turns(workload, codes, rounds=options.repeats, patience=np.inf)
+        print(*(line(row, options.lanes) for row in rows), sep="\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """The workloads S1, S2, S3 (`workloads.py`) by nsjax and by its peers in one run: seconds against the measured error.
 
-    python benchmarks/sweep.py --workload S1 S2 S3 --out benchmarks/sweep.json
+    python benchmarks/sweep.py --out benchmarks/sweep.json
 
-Prints a table in Markdown for each workload. Each row is the median of `--repeats` runs, compile time apart; the error
-is the largest component of what is wanted against the reference, over all lanes.
+Prints a table in Markdown for each workload: medians of the rounds, in each of which every code runs once (what is slow
+in the first three only), ratios to heyoka's batches within a round, compile time apart. The error is the largest
+component of what is wanted against the reference, over all lanes.
 """
 
 import argparse
@@ -11,7 +12,6 @@ import functools as ft
 import json
 import os
 import platform
-import time
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -20,7 +20,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from peers import count_lines, in_chunks, measure, Measured, timed, unpack_checked
+from peers import Code, code_of, count_lines, HEAD, in_chunks, in_turns, line, Measured, unpack_checked
 from workloads import F_SLIP, HAMMER, K, SLIDER, T1, WORKLOADS
 
 import nsjax
@@ -70,6 +70,7 @@ def derivative_lane(v_dr: jax.Array, **options: Any) -> tuple[jax.Array, jax.Arr
     return jax.jacfwd(of, has_aux=True)(jnp.array([*SLIDER, v_dr, F_SLIP, K]))
 
 
+TOLERANCES = {"S1": 1e-10, "S2": 1e-10, "S3": 1e-12}
 LANES: dict[str, tuple[Callable[..., Any], type]] = {
     "S1": (slider_lane, StickSlip),
     "S2": (hammer_lane, Hammer),
@@ -77,67 +78,33 @@ LANES: dict[str, tuple[Callable[..., Any], type]] = {
 }
 
 
-def measure_nsjax(
-    workload: str,
-    tols: list[float],
-    solver: diffrax.AbstractSolver,
-    values: np.ndarray,
-    *,
-    batch: int | None,
-    repeats: int,
-    expected: np.ndarray,
-) -> list[Measured]:
-    """One program for all tolerances; the first run, less a later one, is its compilation."""
+def own_codes(workload: str, tols: list[float], values: np.ndarray, batch: int | None) -> list[Code]:
+    """Each method one program for all tolerances; those whose error does not depend on it with the smallest."""
     lanes = jnp.asarray(values)
     by_hand, model = LANES[workload]
-
-    def lane(p: jax.Array, tol: jax.Array) -> Any:
-        return by_hand(p, tol=tol, solver=solver)
-
-    def run(tol: float) -> Any:
-        return nsjax.sweep(lane, lanes, jnp.asarray(tol), chunk=batch or len(lanes))
-
-    start = time.perf_counter()
-    jax.block_until_ready(run(tols[0]))
-    first = time.perf_counter() - start
-    name = in_chunks(f"nsjax {type(solver).__name__}", batch)
     lines = count_lines((model, final, by_hand))
-    options: dict[str, Any] = dict(lines=lines, repeats=repeats, expected=expected)
-    rows = [
-        timed(workload, name, tol, values, lambda tol=tol: ft.partial(run, tol), unpack_checked, **options)
-        for tol in tols
-    ]
-    return [row._replace(compile_seconds=first - rows[0].seconds) for row in rows]
+    codes = []
+    for solver in (diffrax.Tsit5(), diffrax.Dopri8(), nsjax.Taylor(), nsjax.Exponential(), nsjax.Affine()):
+
+        def lane(p: jax.Array, tol: jax.Array, solver: diffrax.AbstractSolver = solver) -> Any:
+            return by_hand(p, tol=tol, solver=solver)
+
+        name = in_chunks(f"nsjax {type(solver).__name__}", batch)
+        for tol in [min(tols)] if isinstance(solver, nsjax.Exponential | nsjax.Affine) else tols:
+            run = ft.partial(nsjax.sweep, lane, lanes, jnp.asarray(tol), chunk=batch or len(values))
+            codes.append(Code(name, tol, values, lines, lambda run=run: run, unpack_checked))
+    return codes
 
 
 def measure_all(workload: str, args: argparse.Namespace) -> list[Measured]:
     values, few = (WORKLOADS[workload].sweep(n) for n in (args.lanes, args.scipy_lanes))
-    expected = WORKLOADS[workload].reference(values)
-    options: dict[str, Any] = dict(workload=workload, expected=expected, repeats=args.repeats)
-    rows = []
-    own: dict[str, Any] = dict(values=values, **options)
+    tols = args.tol or [TOLERANCES[workload]]
+    codes = [code_of(peer, workload, tol, values) for peer in ("heyoka", "heyoka-batch") for tol in tols]
     for batch in [b or None for b in args.batch]:
-        for solver in (diffrax.Tsit5(), diffrax.Dopri8(), nsjax.Taylor()):
-            rows += measure_nsjax(tols=args.tol, solver=solver, batch=batch, **own)
-        for exact in (nsjax.Exponential(), nsjax.Affine()):  # whose error does not depend on the tolerance
-            rows += measure_nsjax(tols=[min(args.tol)], solver=exact, batch=batch, **own)
-        rows += [measure("diffrax", tol, values, batch_size=batch, **options) for tol in args.tol]
-    rows += [measure(peer, tol, values, **options) for peer in ("heyoka", "heyoka-batch") for tol in args.tol]
-    scipy = measure("DOP853", min(args.tol), few, workload=workload, repeats=1)
-    rows.append(scipy._replace(seconds=scipy.seconds * args.lanes / args.scipy_lanes, lanes=args.lanes))
-    return rows
-
-
-def table(rows: list[Measured]) -> str:
-    lines = [
-        "| code | its user's lines | tolerance | seconds | compile [s] | largest error |",
-        "|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {r.peer} | {r.lines} | {r.tol:.0e} | {r.seconds:.3g} | {r.compile_seconds:.1f} | {r.max_error:.1e} |"
-        for r in rows
-    ]
-    return "\n".join(lines)
+        codes += own_codes(workload, tols, values, batch)
+        codes += [code_of("diffrax", workload, tol, values, batch) for tol in tols]
+    codes.append(code_of("DOP853", workload, min(tols), few))
+    return in_turns(workload, codes, rounds=args.rounds, patience=args.patience)
 
 
 def processor() -> str:
@@ -163,18 +130,20 @@ def machine() -> dict[str, Any]:
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--workload", nargs="+", default=["S1"], choices=WORKLOADS)
+    parser.add_argument("--workload", nargs="+", default=list(WORKLOADS), choices=WORKLOADS)
     parser.add_argument("--lanes", type=int, default=4096)
     parser.add_argument("--scipy-lanes", type=int, default=8, help="scipy runs so many; its time is scaled to all")
-    parser.add_argument("--batch", type=int, nargs="+", default=[0, 256], help="chunks of nsjax and diffrax; 0: vmap")
-    parser.add_argument("--tol", type=float, nargs="+", default=[1e-8, 1e-10, 1e-12])
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--batch", type=int, nargs="+", default=[256], help="chunks of nsjax and diffrax; 0: vmap")
+    parser.add_argument("--tol", type=float, nargs="+", help="instead of 1e-10 (S1, S2) and 1e-12 (S3)")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--patience", type=float, default=6.0, help="seconds of one code, beyond its first three runs")
     parser.add_argument("--out", help="where to write the numbers as JSON")
     args = parser.parse_args()
     rows = []
     for workload in args.workload:
         rows += (found := measure_all(workload, args))
-        print(f"\n### {workload}, {args.lanes} lanes\n\n{table(found)}", flush=True)
+        print(f"\n### {workload}, {args.lanes} lanes\n\n{HEAD}")
+        print(*(line(row, args.lanes) for row in found), sep="\n", flush=True)
     if args.out:
         with open(args.out, "w") as file:
             json.dump({"machine": machine(), "rows": [r._asdict() for r in rows]}, file, indent=1)
