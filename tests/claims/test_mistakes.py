@@ -220,13 +220,15 @@ def test_told_with_the_place(name):
 
 def test_under_jit_and_in_batches():
     """Where numbers are traced the result tells, lane by lane, or an error within the program."""
-    ends = jax.jit(jax.vmap(lambda x: solve(Blow(), 0.0, 2.0, Number(x), throw=False).result))(jnp.asarray([1.0, 0.1]))
+    ends = jax.jit(jax.vmap(lambda x: solve(Blow(), 0.0, 2.0, Number(x), throw=False, **CHEAP).result))(
+        jnp.asarray([1.0, 0.1])
+    )
     np.testing.assert_array_equal(ends == nsjax.RESULTS.dt_min_reached, [True, False])
     np.testing.assert_array_equal(ends == nsjax.RESULTS.successful, [False, True])
-    bad = jax.jit(lambda b: solve(belt(F_stick=b), 0.0, 1.0, AT, throw=False).result)(jnp.asarray(0.5))
+    bad = jax.jit(lambda b: solve(belt(F_stick=b), 0.0, 1.0, AT, throw=False, **CHEAP).result)(jnp.asarray(0.5))
     assert bad == nsjax.RESULTS.wrong_parameter
     with pytest.raises(Exception, match="breakaway bound is at least 1"):
-        jax.jit(lambda b: solve(belt(F_stick=b), 0.0, 1.0, AT).y1)(jnp.asarray(0.5))
+        jax.jit(lambda b: solve(belt(F_stick=b), 0.0, 1.0, AT, **CHEAP).y1)(jnp.asarray(0.5))
 
 
 def test_printed():

@@ -161,7 +161,7 @@ def chain_starts(n):
     }
 
 
-@pytest.mark.parametrize("n", [5, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (5, 10))])
 @pytest.mark.parametrize("start", [pytest.param("mixed", marks=pytest.mark.slow), "slipping", "sticking", "mirrored"])
 def test_many_blocks(start, n):
     """Pitfalls 6, 7, 32: against matrix exponentials; the order of blocks and switches does not matter; and energy is

@@ -96,35 +96,54 @@ nsjax.sgn(0)(1)
 """
 
 
-def diagnostics(tmp_path, text, mode):
-    """What pyright says of a file, to which nsjax is an installed package."""
-    (tmp_path / "model.py").write_text(text)
-    (tmp_path / "pyrightconfig.json").write_text(json.dumps({"typeCheckingMode": mode}))
-    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "--outputjson", "-p", str(tmp_path)]
+README = MODEL + CALLS + "".join(f"reveal_type({expression})\n" for expression in REVEALED)
+FILES = {
+    "basic": ("basic", README),
+    "standard": ("standard", README),
+    "switches": ("strict", SWITCHES),
+    "twice": ("basic", SWITCHES + TWICE),
+}
+
+
+@pytest.fixture(scope="module")
+def diagnostics(tmp_path_factory):
+    """What pyright says of each file, to which nsjax is an installed package. It reads that once for all of them."""
+    folder = tmp_path_factory.mktemp("models")
+    for name, (mode, text) in FILES.items():
+        (folder / f"{name}.py").write_text(f"# pyright: {mode}\n{text}")
+    command = [
+        sys.executable,
+        "-m",
+        "pyright",
+        "--pythonpath",
+        sys.executable,
+        "--outputjson",
+        *(f"{name}.py" for name in FILES),
+    ]
     env = os.environ | {"PYTHONPATH": str(ROOT), "PYRIGHT_PYTHON_IGNORE_WARNINGS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=tmp_path)
+    done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=folder)
     found = json.loads(done.stdout)
-    assert found["summary"]["filesAnalyzed"] == 1, done.stderr
-    return found["generalDiagnostics"]
+    assert found["summary"]["filesAnalyzed"] == len(FILES), done.stderr
+    told = found["generalDiagnostics"]
+    return {name: [d for d in told if pathlib.Path(d["file"]).stem == name] for name in FILES}
 
 
 @pytest.mark.parametrize("mode", ["basic", "standard"])
-def test_the_model_of_the_readme_has_no_errors_and_known_types(tmp_path, mode):
-    text = MODEL + CALLS + "".join(f"reveal_type({expression})\n" for expression in REVEALED)
-    found = diagnostics(tmp_path, text, mode)
+def test_the_model_of_the_readme_has_no_errors_and_known_types(diagnostics, mode):
+    found = diagnostics[mode]
     assert [d["message"] for d in found if d["severity"] != "information"] == []
     types = [re.search('is "(.*)"$', d["message"])[1] for d in found]
     assert dict(zip(REVEALED, types)) == REVEALED
 
 
-def test_every_switch_may_be_completed_under_its_own_name(tmp_path):
+def test_every_switch_may_be_completed_under_its_own_name(diagnostics):
     # (In strict mode the types of JAX's dependencies are partly unknown, which is no matter of the model's.)
-    found = diagnostics(tmp_path, SWITCHES, "strict")
+    found = diagnostics["switches"]
     assert [d["message"] for d in found if d.get("rule") != "reportUnknownMemberType"] == []
 
 
-def test_nothing_else_is_overlooked_for_it(tmp_path):
-    rules = [d.get("rule") for d in diagnostics(tmp_path, SWITCHES + TWICE, "basic")]
+def test_nothing_else_is_overlooked_for_it(diagnostics):
+    rules = [d.get("rule") for d in diagnostics["twice"]]
     assert rules == ["reportRedeclaration", "reportCallIssue"]
 
 

@@ -90,6 +90,14 @@ def test_run_writes_the_numbers(run_34):
     assert times[3] - times[1] == pytest.approx(PERIOD, abs=1e-9)
 
 
+def test_numbers_on_standard_output():
+    """(By the program that `run_34` has.)"""
+    status, out, err = run("orbit", "3.4", "--json", "-")
+    assert status == 0, err
+    check_stick_slip_orbit(json.loads(out)["orbit"])  # and nothing else
+
+
+@pytest.mark.slow  # (by default the blocks of the README run, tests/claims/test_site.py, and files of models below)
 def test_orbit_of_the_model_in_the_readme(tmp_path):
     (tmp_path / "belt.py").write_text(re.search(r"```python\n(.*?)```", README.read_text(), re.DOTALL)[1])
     name = f"{tmp_path / 'belt.py'}:StickSlip"

@@ -9,7 +9,7 @@ import pytest
 from command_line import run
 
 import nsjax
-from nsjax import _cli, gallery
+from nsjax import __main__ as command, _cli, gallery
 from nsjax._cli import _branches, _follow
 
 
@@ -81,6 +81,16 @@ def test_special_points_have_their_letters(found, job):
     assert {line.get_label() for line in ax.lines} >= {"stable equilibrium", "unstable periodic orbit"}
 
 
+def test_pictures_of_one_family(found, job, tmp_path):
+    """With the paths of its multipliers at corners."""
+    (one,) = (one for one in found if one.family.name == "P5 and P6")
+    files = _cli.draw_branches(job, [one], _cli.diagram_for(job, None, None), tmp_path)
+    names = {path.name.removeprefix("A.9-").removesuffix(".png") for path in files}
+    assert names >= {"bifurcation-diagram", "multiplier-diagram-P5-and-P6", "multiplier-circles"}
+    assert all(path.stat().st_size > 10_000 for path in files)
+
+
+@pytest.mark.slow
 def test_a_picture_for_each_figure(found, job, tmp_path):
     files = _cli.draw_branches(job, found, _cli.diagram_for(job, None, None), tmp_path)
     names = {path.name.removeprefix("A.9-").removesuffix(".png") for path in files}
@@ -108,6 +118,7 @@ def test_what_is_followed_and_what_is_left_out(found, monkeypatch, tmp_path):
     monkeypatch.setattr(_follow, "continue_equilibrium", equilibria)
     monkeypatch.setattr(_follow, "find", lambda *args: (Orbit, None))
     monkeypatch.setattr(_follow, "try_guess", lambda *args: (Orbit, None))
+    monkeypatch.setattr(command, "draw_branches", lambda *args: [])  # for which there are other tests
     status, out, err = run(
         *"continue A.9 --range 2.5,2.55 --set omega=2.52".split(),
         "--out",

@@ -123,6 +123,16 @@ def duffing():
     return branch_of(Duffing(), Motion(0.5, 0.0), "omega", (0.9, 2.4))
 
 
+@pytest.fixture(scope="module")
+def wall():
+    """In each mode its field is affine, which makes small programs."""
+    return branch_of(WALL, Motion(-3.0, 0.0), "omega", (1.05, 1.35))
+
+
+def fold_of(branch):
+    return next(b for b in branch.bifurcations if b.kind == "fold" and not b.discontinuous)
+
+
 @pytest.mark.slow
 def test_folds_and_cusp(duffing):
     """Without switches: the folds of Duffing's oscillator meet in a cusp, through which the curve goes on."""
@@ -153,11 +163,10 @@ def test_folds_and_cusp(duffing):
 
 
 @pytest.mark.slow
-def test_fold_meets_grazing():
+def test_fold_meets_grazing(wall):
     """The linear response touches the wall where its amplitude is the distance. The fold of the orbits with contact
     ends there where their multiplier, with the limit of the saltation matrix, is 1."""
-    branch = branch_of(WALL, Motion(-3.0, 0.0), "omega", (1.05, 1.35))
-    corner, fold = (next(b for b in branch.bifurcations if b.discontinuous == d) for d in (True, False))
+    corner, fold = (next(b for b in wall.bifurcations if b.discontinuous == d) for d in (True, False))
     grazing, folds = (continue_bifurcation(b, "x_c", (0.5, 12.0)) for b in (corner, fold))
     omega, x_c = grazing.values.T
     np.testing.assert_allclose(np.abs(1 - omega**2 + 0.05j * omega) * x_c, 1, atol=1e-10)
@@ -274,34 +283,44 @@ def test_infinitely_unstable_folds():
     [
         (dict(parameter="omega"), "another one than that of the branch"),
         (dict(parameter="speed"), "must be one of"),
-        (dict(interval=(1.5, 2.0)), "must be \\(low, high\\) and hold 1"),
+        (dict(interval=(4.5, 5.0)), "must be \\(low, high\\) and hold 4"),
         (dict(first=(0.5, 0.6)), "`first` must be \\(low, high\\)"),
     ],
 )
-def test_mistakes(duffing, change, message):
+def test_mistakes(wall, change, message):
     with pytest.raises(ValueError, match=message):
-        continue_bifurcation(duffing.bifurcations[0], **(dict(parameter="F", interval=(0.5, 1.5)) | change))
+        continue_bifurcation(fold_of(wall), **(dict(parameter="x_c", interval=(3.5, 4.5)) | change))
 
 
-def test_another_parameter_is_no_new_program(duffing):
+@pytest.mark.parametrize(
+    "name, system, start, intervals",
+    [
+        ("wall", WALL, Motion(-3.0, 0.0), dict(omega=(1.14, 1.16), x_c=(3.9, 4.1), k_f=(0.95, 1.05))),
+        pytest.param(
+            "duffing", Duffing(), Motion(0.5, 0.0), dict(omega=(0.99, 1.01), F=(0.9, 1.1), c=(0.18, 0.22)),
+            marks=pytest.mark.slow,
+        ),
+    ],
+)  # fmt: skip
+def test_another_parameter_is_no_new_program(name, system, start, intervals, request):
     """Issue 22: of one parameter, or of two."""
-    system, fold = Duffing(), duffing.bifurcations[0]
-    orbit = orbit_of(system, Motion(0.5, 0.0))
-    continue_orbit(system, orbit, "omega", (0.99, 1.01))  # tests before this one may have been told to forget
+    fold, orbit = fold_of(request.getfixturevalue(name)), orbit_of(system, start)
+    of, one, other = intervals
+    continue_orbit(system, orbit, of, intervals[of])  # tests before this one may have been told to forget
     with compilations() as compiled:
-        branch = continue_orbit(system, orbit, "F", (0.9, 1.1))
+        branch = continue_orbit(system, orbit, one, intervals[one])
         assert len(branch) > 3 and not compiled
-    first = continue_bifurcation(fold, "F", (0.9, 1.1))
+    first = continue_bifurcation(fold, one, intervals[one])
     with compilations() as compiled:
-        second = continue_bifurcation(fold, "c", (0.18, 0.22))
+        second = continue_bifurcation(fold, other, intervals[other])
         assert not compiled
-    for curve, name in ((first, "F"), (second, "c")):
-        assert len(curve) > 3 and curve.parameters == ("omega", name) and np.ptp(curve.values[:, 1]) > 0.03
+    for curve, varied in ((first, one), (second, other)):
+        assert len(curve) > 3 and curve.parameters == (of, varied) and np.ptp(curve.values[:, 1]) > 0.03
 
 
-def test_a_loaded_point(duffing):
+def test_a_loaded_point(wall):
     with pytest.raises(ValueError, match="loaded from a file"):
-        continue_bifurcation(dataclasses.replace(duffing.bifurcations[0], origin=None), "F", (0.5, 1.5))
+        continue_bifurcation(dataclasses.replace(fold_of(wall), origin=None), "x_c", (3.5, 4.5))
 
 
 @pytest.mark.slow

@@ -79,7 +79,7 @@ CASES = {
 
 
 # Of these every run of the tests makes sure, of the others the slow ones (and the notebook on equilibria).
-QUICK = ("(5.17), α = -1", "(5.18)", "(5.25)", "(5.29)", "(5.32)")
+QUICK = ("(5.17), α = -1", "(5.25)", "(5.32)")
 
 
 def marked(names):
@@ -120,12 +120,17 @@ def test_exact_value_of_the_smoothed_bifurcations():
     assert abs(root - ROOT) < 1e-15
 
 
+@pytest.mark.slow
 def test_places_on_two_surfaces(found):
-    """(q_left, q_right) of 5.5 (ERRATA), (q_1, q_2) of 5.4, and the four of 5.7, with their eigenvalues."""
+    """(q_left, q_right) of 5.5 (ERRATA), and (q_1, q_2) of 5.4."""
     (b,) = found("(5.18)").bifurcations
     assert b.places == [{"left": pytest.approx(0.75, abs=1e-12), "right": pytest.approx(0.25, abs=1e-12)}]
     (b,) = found("(5.11)").bifurcations
     assert b.places == [{"kink": pytest.approx(0.5, abs=1e-12), "parameter": pytest.approx(0.5, abs=1e-12)}]
+
+
+def test_places_on_four_surfaces(found):
+    """Those of 5.7, with their eigenvalues."""
     (b,) = found("(5.32)").bifurcations
     for place, q in zip(b.places, (0.25, 0.75)):
         assert place == pytest.approx({"left": q, "right": 1 - q, "below": q, "above": 1 - q}, abs=1e-12)
@@ -276,7 +281,7 @@ def test_closed_branch():
         (gallery.HopfPitchfork(0.0), Plane(0.0, 0.0), ["Hopf-pitchfork"]),
         (gallery.DiscontinuousSaddleNode(0.0), Line(0.0), ["saddle-node"]),
         (gallery.Pitchfork(0.0), Line(0.0), ["pitchfork"]),
-        (gallery.SaddleNode(0.0), Line(0.0), ["saddle-node"]),
+        pytest.param(gallery.SaddleNode(0.0), Line(0.0), ["saddle-node"], marks=pytest.mark.slow),
         (gallery.Hopf(0.0), Plane(0.0, 0.0), ["Hopf"]),
         pytest.param(gallery.DiscontinuousPitchfork(1.0), Line(0.9), ["pitchfork"], marks=pytest.mark.slow),
         pytest.param(gallery.HopfPitchfork(1.0), Plane(2.1, 0.1), ["Hopf-pitchfork"], marks=pytest.mark.slow),

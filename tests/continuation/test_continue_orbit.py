@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
-from branches import continue_orbit, orbit_of, same_multipliers, stability_agrees, the
+from branches import continue_orbit, orbit_of, QUICK, same_multipliers, stability_agrees, the
 from models import Motion, Stop
 
 import nsjax
@@ -180,7 +180,7 @@ def test_growing():
     """A branch can be looked at while it grows, left, and gone on with."""
     system = gallery.StickSlip(c=0.1, v_dr=0.5)
     orbit = orbit_of(system, Motion(2.0, 0.0), period=8.0)
-    growth = nsjax.OrbitContinuation(system, orbit, "v_dr", (0.45, 0.6))
+    growth = nsjax.OrbitContinuation(system, orbit, "v_dr", (0.45, 0.6), **QUICK)
     for point in growth:
         if point.parameter > 0.52:
             break
@@ -303,7 +303,7 @@ def test_the_wall_that_is_hit():
 def test_a_branch_shrinks_to_a_hopf_point(alpha, criticality):
     """(5.25): r = √(-μ/α), period 2π/(ω + β r²). The parameter is even in the size, but the orbits do not turn back."""
     system = gallery.Hopf(mu=-0.8 * alpha, alpha=alpha)
-    orbit = nsjax.find_orbit(system, gallery.Plane(0.894, 0.0), period=2 * np.pi / 1.8)
+    orbit = orbit_of(system, gallery.Plane(0.894, 0.0), period=2 * np.pi / 1.8)
     branch = continue_orbit(system, orbit, "mu", (-1.0, 1.0))
     (hopf,) = branch.special_points
     assert hopf.name == f"Hopf bifurcation, {criticality}" and not branch.others

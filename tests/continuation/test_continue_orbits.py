@@ -48,10 +48,9 @@ GAPS = np.array([1.5, 2.0, 0.5, 5.0])  # at the third the wall is hit: no orbit 
 
 @pytest.fixture(scope="module")
 def walls():
-    def search(gap):
-        return find_orbit(Wall(gap=gap), Motion(1.05, 0.0), order=1, **HOW)
-
-    orbits = sweep(search, jnp.asarray(GAPS))
+    """Searches one after the other are a smaller program than `sweep`, which `duffing` below has."""
+    found = [find_orbit(Wall(gap=jnp.asarray(gap)), Motion(1.05, 0.0), order=1, **HOW) for gap in GAPS]
+    orbits = jax.tree.map(lambda *each: jnp.stack(each), *found)
     return orbits, continue_orbits(orbits, "omega", (0.1, 1.5))
 
 

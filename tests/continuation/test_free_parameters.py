@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from branches import continue_orbit, orbit_of
 from models import Duffing, Motion
 
@@ -26,26 +27,64 @@ class Power(nsjax.System):
         return 2 * jnp.pi / self.omega
 
 
+class Stiff(nsjax.System):
+    """A linear oscillator. The derivative of its stiffness by a is infinite."""
+
+    a: float = 0.0
+    c: float = 0.2
+    omega: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, jnp.cos(self.omega * t) - self.c * y.v - (1 + jnp.sqrt(self.a)) * y.x)
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+
 START = Motion(0.5, 0.5)
 
 
-def test_a_parameter_that_is_not_free_may_have_no_derivative(monkeypatch):
-    """Zero times an infinite derivative, or one that is NaN, is no part of an answer: another program finds it."""
-    fixed = []
-    program = _point._correct
+@pytest.fixture
+def heard(monkeypatch):
+    """Whether parameters are fixed in the program, and whether it holds loops of the solver, call by call."""
+    calls, program = [], _point._correct
 
     class Heard:
         def at(self, curve, *args, **how):
-            fixed.append(isinstance(curve.free.free, tuple))
-            assert how == dict(loops=True)  # of the solver, as neither field is affine
+            calls.append((isinstance(curve.free.free, tuple), how["loops"]))
             return program.at(curve, *args, **how)
 
     monkeypatch.setattr(_point, "_correct", Heard())
+    return calls
+
+
+def test_a_parameter_that_is_not_free_may_have_no_derivative(heard):
+    """Zero times an infinite derivative is no part of an answer: another program finds it. A linear field goes by
+    exponentials, of which programs are small."""
+    system = Stiff()
+    branch = continue_orbit(system, orbit_of(system, START), "omega", (0.9, 1.1), max_step=0.1)
+    assert set(heard) == {(False, False), (True, False)}
+    omega = branch.values
+    response = np.exp(1j * omega * branch.ts) / (1 - omega**2 + 0.2j * omega)
+    np.testing.assert_allclose(branch.ys.x, response.real, atol=1e-9)
+    np.testing.assert_allclose(np.prod(branch.multipliers, axis=1), np.exp(-0.2 * branch.periods), rtol=1e-9)
+    heard.clear()
+    system = Stiff(a=1.0)  # at which the derivative is finite
+    continue_orbit(system, orbit_of(system, START), "omega", (0.9, 1.1), max_step=0.1)
+    assert set(heard) == {(False, False)}
+
+
+@pytest.mark.slow
+def test_the_same_by_steps_of_the_solver(heard):
+    """A derivative that is NaN is no part of an answer either."""
     branches = []
     for system in (Duffing(), Power()):
-        fixed.clear()
+        heard.clear()
         branches.append(continue_orbit(system, orbit_of(system, START), "omega", (0.9, 1.1), max_step=0.1))
+        fixed, loops = zip(*heard)
         assert any(fixed) == isinstance(system, Power)
+        assert all(loops)  # as neither field is affine
     plain, power = branches
     np.testing.assert_allclose(power.values, plain.values, rtol=1e-9)
     np.testing.assert_allclose(power.multipliers, plain.multipliers, rtol=1e-7)

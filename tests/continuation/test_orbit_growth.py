@@ -5,7 +5,6 @@ from functools import partial
 from typing import NamedTuple
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -20,6 +19,7 @@ from nsjax._numerics._progress import ProgressLine
 
 
 METHOD = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-12), max_steps=8192)
+BELT = dict(solver=dfx.Tsit5())  # with which loading needs to be told
 
 
 class Duffing(nsjax.System):
@@ -73,8 +73,8 @@ def grown(system, orbit, parameter, interval, **options):
 def belt():
     """Section 6.7, through the fold beyond which orbits are infinitely unstable."""
     system = gallery.StickSlip(c=0.1, v_dr=0.5)
-    orbit = find_orbit(system, Motion(2.0, 0.0), period=8.0)
-    what, options = (system, orbit, "v_dr", (0.45, 1.3)), dict(record={"stick": sticking, "ends": ends})
+    orbit = find_orbit(system, Motion(2.0, 0.0), period=8.0, **BELT)
+    what, options = (system, orbit, "v_dr", (0.45, 1.3)), dict(record={"stick": sticking, "ends": ends}, **BELT)
     return what, options, *grown(*what, **options)
 
 
@@ -87,7 +87,10 @@ def duffing():
     return what, options, *grown(*what, **options)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.55, 0.8, 1.0])
+@pytest.mark.parametrize(
+    "share",
+    [pytest.param(x, marks=[pytest.mark.slow] * (x not in (0.2, 0.55))) for x in (0.0, 0.2, 0.5, 0.55, 0.8, 1.0)],
+)
 def test_gone_on_with(belt, tmp_path, share):
     what, options, whole, count = belt
     growth = OrbitContinuation(*what, **options)
@@ -179,11 +182,11 @@ def test_equilibria(tmp_path, y):
     assert type(loaded.ys) is Plane and type(loaded.special[0].halves[0].tangent[0]) is Plane
 
 
-def test_mistakes(belt, duffing, tmp_path):
-    path = tmp_path / "growth"
-    duffing[2].save(path)
+def test_mistakes(belt, tmp_path):
+    path, (_, options, growth, _) = tmp_path / "growth", belt
+    growth.save(path)
     whole = path.read_bytes()
-    load, model = partial(OrbitContinuation.load, record=MEASURES), Duffing()
+    load, model = partial(OrbitContinuation.load, **options), gallery.StickSlip()
     for size in (0, 10, len(whole) // 2, len(whole) - 30):
         path.write_bytes(whole[:size])
         with pytest.raises(ValueError, match="damaged, or nsjax did not write it"):
@@ -216,26 +219,31 @@ def test_mistakes(belt, duffing, tmp_path):
         with pytest.raises(ValueError, match=message):
             load(path, model)
     path.write_bytes(whole)
-    with pytest.raises(ValueError, match="must be a model like that of the file, Duffing.*but is StickSlip"):
-        load(path, gallery.StickSlip())
+    with pytest.raises(ValueError, match="must be a model like that of the file, StickSlip.*but is Duffing"):
+        load(path, Duffing())
     with pytest.raises(ValueError, match="must be a model like that of the file"):
-        load(path, Duffing(c=jnp.zeros(2)))
+        load(path, gallery.StickSlip(c=jnp.zeros(2)))
     with pytest.raises(ValueError, match="must be a state like those of the file"):
-        load(path, model, Motion(0.0, 0.0))
+        load(path, model, {"x": 0.0, "v": 0.0})
     with pytest.raises(ValueError, match="must be those with which the branch was begun"):
-        load(path, model, solver=dfx.Tsit5())
+        load(path, model, solver=dfx.Dopri8())
     with pytest.raises(ValueError, match="must be those with which the branch was begun"):
         load(path, model, stepsize_controller=pid(1e-11))
     with pytest.raises(ValueError, match="must hold functions of the names"):
-        load(path, model, record={"mean": MEASURES["mean"]})
+        load(path, model, record={"ends": ends})
 
 
-def test_records(belt, duffing):
+@pytest.mark.slow
+def test_records_of_several_branches(duffing):
     """Against what else is known of the orbits, and a balance of power."""
     for part in duffing[2].branch.branches:
         np.testing.assert_allclose(part.records["mean"], part.mean["x"], atol=2e-3)
         np.testing.assert_allclose(part.records["input"], part.records["loss"], rtol=1e-2)
         np.testing.assert_array_less(0.1, part.records["loss"])
+
+
+def test_records(belt):
+    """Also arrays."""
     part = belt[2].branch
     bounds, stick = part.records["ends"], part.records["stick"]
     assert bounds.shape == (len(part), 2, 2)
@@ -245,48 +253,51 @@ def test_records(belt, duffing):
     np.testing.assert_array_less(stick, part.periods)
 
 
-def test_records_are_drawn(duffing):
-    branch = duffing[2].branch
-    ax = nsjax.plot.orbit_diagram(branch, "loss", labels={"loss": "P [W]"}, names=False)
-    assert ax.get_ylabel() == "P [W]"
+def test_records_are_drawn(belt):
+    branch = belt[2].branch
+    ax = nsjax.plot.orbit_diagram(branch, "stick", labels={"stick": "t [s]"}, names=False)
+    assert ax.get_ylabel() == "t [s]"
     drawn = np.concatenate([line.get_ydata() for line in ax.lines])
-    assert np.isin(branch.records["loss"], drawn).all()
+    assert np.isin(branch.records["stick"], drawn).all()
     with pytest.raises(ValueError, match="one number for each|a number for each"):
-        nsjax.plot.orbit_diagram(eqx.tree_at(lambda b: b.records["loss"], branch, np.zeros((len(branch), 2))), "loss")
+        nsjax.plot.orbit_diagram(branch, "ends")
     plt.close("all")
 
 
 @pytest.mark.parametrize(
     "record, message",
     [
-        ({"speed": lambda ts, ys: ys["u"]}, "`record\\['speed'\\]` failed .* KeyError"),
-        ({"ys": lambda ts, ys: ys}, "`record\\['ys'\\]` must return a number or an array"),
+        ({"speed": lambda ts, ys: {"x": ys.x}["u"]}, "`record\\['speed'\\]` failed .* KeyError"),
+        ({"ys": lambda ts, ys: ys._asdict()}, "`record\\['ys'\\]` must return a number or an array"),
         ({"sum": 3.0}, "must map names to functions, but maps 'sum' to 3.0"),
         ({3: np.mean}, "must map names to functions"),
     ],
 )
-def test_mistaken_records(duffing, record, message):
+def test_mistaken_records(belt, record, message):
     with pytest.raises(ValueError, match=message):
-        OrbitContinuation(*duffing[0], record=record)
+        OrbitContinuation(*belt[0], record=record, **BELT)
 
 
-def test_records_of_changing_shape(duffing):
+def test_records_of_changing_shape(belt):
     counter = iter(range(1, 100))
-    growth = OrbitContinuation(*duffing[0], record={"more": lambda ts, ys: np.zeros(next(counter))})
+    growth = OrbitContinuation(*belt[0], record={"more": lambda ts, ys: np.zeros(next(counter))}, **BELT)
     with pytest.raises(ValueError, match="`record\\['more'\\]` must return arrays of one shape, but gave \\(2,\\)"):
         next(growth)
 
 
-def test_progress(duffing, capsys):
-    what, options, whole, count = duffing
+@pytest.mark.parametrize(
+    "name, parameter, last", [("belt", "v_dr", 1), pytest.param("duffing", "omega", 2, marks=pytest.mark.slow)]
+)
+def test_progress(name, parameter, last, request, capsys):
+    what, options, whole, count = request.getfixturevalue(name)
     branch = nsjax.continue_orbit(*what, **options, progress_meter=dfx.TextProgressMeter())
     same(branch, whole.branch)
     written = capsys.readouterr().err
     assert written.endswith("\n") and written.count("\n") == 1
     lines = written.strip("\n").split("\r")
     assert lines[0] == "" and 2 <= len(lines) < count
-    assert lines[1].startswith("branch 1, 2 points, omega = ") and lines[1].endswith(", 0 special points")
-    assert lines[-1].startswith("branch 2, ") and lines[-1].rstrip() == str(whole) == repr(whole)
+    assert lines[1].startswith(f"branch 1, 2 points, {parameter} = ") and lines[1].endswith(", 0 special points")
+    assert lines[-1].startswith(f"branch {last}, ") and lines[-1].rstrip() == str(whole) == repr(whole)
     assert sum(len(part) for part in branch.branches) == pytest.approx(int(lines[-1].split()[2]), abs=1)
 
 

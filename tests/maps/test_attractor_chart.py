@@ -96,8 +96,15 @@ def test_it_goes_on_where_it_was(logistic, tmp_path, monkeypatch):
         nsjax.attractor_chart(Logistic(), {**OVER, "a": OVER["a"] + 0.1}, START, path=tmp_path, **BEATS)
 
 
-def test_failures_say_so(logistic):
-    """Where the next beat is later than `max_time`, nothing returns. The other lanes are as they were."""
+def test_failures_say_so():
+    """Where the next beat is later than `max_time`, nothing returns. (One program with the chart above.)"""
+    found = nsjax.attractor_chart(Logistic(pause=5.0), OVER, START, **BEATS)
+    assert found.failed.all() and (found.periods == -1).all() and not found.chaotic.any()
+    assert (found.kinds() == "no_return").all() and np.isnan(found.ys.x).all() and "22 no_return" in str(found)
+
+
+@pytest.mark.slow
+def test_failures_harm_no_other_lane(logistic):
     over = {"a": OVER["a"], "pause": np.array([1.0, 5.0])}
     found = nsjax.attractor_chart(Logistic(), over, START, **BEATS)
     np.testing.assert_array_equal(found.periods[:, 0], logistic.periods[:, 0])

@@ -16,11 +16,14 @@ from nsjax.orbits._passage import passage
 from nsjax.plot._path import once_round
 
 
+QUICK = dict(solver=diffrax.Tsit5())  # of half the size of the default; tests of one system share its program
+
+
 def test_a_new_number_is_no_new_program():
     """Issue 22: neither another parameter nor another guess is compiled for."""
-    find_orbit(gallery.StickSlip(), Motion(2.02, 0.0), period=13.54)
+    find_orbit(gallery.StickSlip(), Motion(2.02, 0.0), period=13.54, **QUICK)
     with compilations() as compiled:
-        orbit = find_orbit(gallery.StickSlip(v_dr=0.25), Motion(2.0, 0.1), period=12.0)
+        orbit = find_orbit(gallery.StickSlip(v_dr=0.25), Motion(2.0, 0.1), period=12.0, **QUICK)
         assert orbit.stable and not compiled
         jax.jit(lambda x: x + 3)(jnp.ones(7)).block_until_ready()
         assert compiled  # it would have been heard
@@ -46,7 +49,7 @@ def test_once_round_an_orbit_by_the_program_that_found_it(key, monkeypatch):
     """A picture of an orbit that was found compiles no solution of its own; the solution is the same."""
     given = gallery.entry(key)
     period = {} if given.system().period is not None else dict(period=given.orbit.period)
-    orbit = find_orbit(given.system(), given.orbit.y0, **period)
+    orbit = find_orbit(given.system(), given.orbit.y0, **period, **QUICK)
     own = orbit.solve()
     monkeypatch.delattr(type(orbit), "solve")
     sol = once_round(orbit)
@@ -58,7 +61,7 @@ def test_once_round_an_orbit_by_the_program_that_found_it(key, monkeypatch):
 
 def test_a_point_on_a_surface_needs_its_mode():
     """The program knows of no modes but those of relays: where the orbit slides, h alone does not say how it goes on."""
-    orbit = find_orbit(gallery.thesis("3.4"), Motion(2.02, 0.0), period=13.54)
+    orbit = find_orbit(gallery.thesis("3.4"), Motion(2.02, 0.0), period=13.54, **QUICK)
     stick = next(e for e in orbit.events if e.mode_after == {"belt": 0})
     assert passage(orbit, stick.t, stick.y_after, (0,)) is not None  # attracted, so that it is the only way
     assert passage(orbit, orbit.t0, orbit.y0, (0,)) is None
@@ -70,7 +73,7 @@ def test_a_program_that_is_not_there_is_not_compiled_for_a_picture():
     class Other(gallery.StickSlip):
         pass
 
-    orbit = find_orbit(gallery.thesis("3.4"), Motion(2.02, 0.0), period=13.54)
+    orbit = find_orbit(gallery.thesis("3.4"), Motion(2.02, 0.0), period=13.54, **QUICK)
     assert passage(orbit, orbit.t0, orbit.y0, orbit.mode) is not None
     assert passage(dataclasses.replace(orbit, system=Other()), orbit.t0, orbit.y0, orbit.mode) is None
 
@@ -110,7 +113,7 @@ def test_one_program_finds_the_same(case):
 
 def test_constants_within_a_program():
     """Within `jax.jit` not even constants are known to Python: there is one try, and no question of their values."""
-    period = jax.jit(lambda: find_orbit(Rotor(), Motion(1.1, 0.0), period=6.2, backward=True).period)()
+    period = jax.jit(lambda: find_orbit(Rotor(), Motion(1.1, 0.0), period=6.2, backward=True, **QUICK).period)()
     np.testing.assert_allclose(period, 2 * np.pi, rtol=1e-9)
 
 

@@ -20,7 +20,7 @@ def closed():
 
 @pytest.fixture(scope="module")
 def pitchfork():
-    return nsjax.continue_equilibrium(gallery.DiscontinuousPitchfork(mu=-1.0), Line(0.0), "mu", (-1.0, 1.0))
+    return nsjax.continue_equilibrium(gallery.Pitchfork(mu=-1.0), Line(0.0), "mu", (-1.0, 1.0))
 
 
 @pytest.fixture

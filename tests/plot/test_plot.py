@@ -60,9 +60,10 @@ def test_arcs_are_the_solution_between_events():
     cuts = [0.0, *sol.events.t[:3].tolist(), 20.0]
     for arc, start, stop in zip(pieces, cuts, cuts[1:]):
         np.testing.assert_allclose(arc.t[[0, -1]], [start, stop], atol=1e-12)
-        exact = jax.vmap(sol.evaluate)(jnp.asarray(arc.t[1:-1]))
-        np.testing.assert_allclose(arc.y["x"][1:-1], exact.x, atol=1e-12)
-        np.testing.assert_allclose(arc.y["v"][1:-1], exact.v, atol=1e-12)
+    ts, x, v = (np.concatenate([a[1:-1] for a in each]) for each in zip(*((p.t, p.y["x"], p.y["v"]) for p in pieces)))
+    exact = jax.jit(jax.vmap(sol.evaluate))(jnp.asarray(ts))
+    np.testing.assert_allclose(x, exact.x, atol=1e-12)
+    np.testing.assert_allclose(v, exact.v, atol=1e-12)
 
 
 def test_arcs_have_both_sides_of_an_impact():
@@ -195,7 +196,7 @@ def test_mistakes_are_named():
     with pytest.raises(ValueError, match="no component 'z'.*x, v"):
         plot.phase_portrait(stick_slip(), "z")
     with pytest.raises(ValueError, match="SaveAt"):
-        plot.time_series(nsjax.solve(gallery.thesis("(2.3)"), 0.0, 0.5, gallery.Line(1.0)))
+        plot.time_series(nsjax.solve(Measured(), 0.0, 0.5, gallery.Motion(1.0, 0.0)))
     with pytest.raises(ValueError, match="at least 2 components"):
         plot.poincare_section(gallery.Line(np.zeros(3)))
     batch = jax.tree.map(lambda x: x[None] if isinstance(x, jax.Array) else x, ball())
@@ -206,6 +207,7 @@ def test_mistakes_are_named():
 # Orbits.
 
 
+BELT = gallery.StickSlip(c=0.1, v_dr=0.5)
 LOOSE = dict(
     solver=dfx.Tsit5(), stepsize_controller=dfx.PIDController(rtol=1e-9, atol=1e-9), max_steps=512, max_events=8
 )
@@ -213,13 +215,13 @@ LOOSE = dict(
 
 @functools.cache
 def stable():
-    return nsjax.find_orbit(gallery.StickSlip(c=0.1, v_dr=0.5), gallery.Motion(1.0, -1.1), period=7.6, **LOOSE)
+    return nsjax.find_orbit(BELT, gallery.Motion(1.0, -1.1), period=7.6, **LOOSE)
 
 
 @functools.cache
 def infinitely_unstable():
     segments = [nsjax.Segment(-1, 3.0), nsjax.Segment(0, 1.0, free=True), nsjax.Segment(-1, 2.5)]
-    return nsjax.find_orbit(stable().system, gallery.Motion(1.0, -0.575), segments=segments, **LOOSE)
+    return nsjax.find_orbit(BELT, gallery.Motion(1.0, -0.575), segments=segments, **LOOSE)
 
 
 def images(ax):
@@ -307,8 +309,22 @@ def test_an_orbit_that_no_solution_follows_is_drawn_arc_by_arc():
     assert plot.time_series(orbit).get_lines()[0].get_xdata()[0] == 0
 
 
-def test_infinite_multipliers_stand_at_the_edge():
-    ax = plot.multipliers(infinitely_unstable())
+def with_multipliers(*multipliers):
+    """As much of an orbit as the picture of its multipliers needs."""
+    system = types.SimpleNamespace(period=None)
+    stable = max(abs(x) for x in multipliers) <= 1
+    return types.SimpleNamespace(multipliers=jnp.array(multipliers, complex), stable=jnp.asarray(stable), system=system)
+
+
+@pytest.mark.parametrize(
+    "orbit",
+    [
+        pytest.param(lambda: with_multipliers(jnp.inf, 1.0), id="given"),
+        pytest.param(lambda: infinitely_unstable(), id="found", marks=pytest.mark.slow),
+    ],
+)
+def test_infinite_multipliers_stand_at_the_edge(orbit):
+    ax = plot.multipliers(orbit())
     (arrow,) = [line for line in ax.get_lines() if line.get_marker() == ">"]
     assert arrow.get_transform() == ax.get_yaxis_transform() and arrow.get_xydata().tolist() == [[1.0, 0.0]]
     assert [text.get_text() for text in ax.texts] == ["∞"]
@@ -317,8 +333,15 @@ def test_infinite_multipliers_stand_at_the_edge():
     assert trivial.get_markerfacecolor() == "white"
 
 
-def test_multipliers_of_several_orbits():
-    ax = plot.multipliers([stable(), infinitely_unstable()])
+@pytest.mark.parametrize(
+    "orbits",
+    [
+        pytest.param(lambda: [with_multipliers(1.0, 0.0), with_multipliers(jnp.inf, 1.0)], id="given"),
+        pytest.param(lambda: [stable(), infinitely_unstable()], id="found", marks=pytest.mark.slow),
+    ],
+)
+def test_multipliers_of_several_orbits(orbits):
+    ax = plot.multipliers(orbits())
     assert {"orbit 1, stable", "orbit 2, unstable", "along the orbit"} == set(legend_names(ax))
     assert sum(len(line.get_xdata()) == 361 for line in ax.get_lines()) == 1
     assert {line.get_marker() for line in ax.get_lines() if line.get_label() == "orbit 1, stable"} == {"o"}
@@ -360,7 +383,7 @@ def test_bifurcation_diagram_of_a_function():
 
 
 def test_bifurcation_diagram_with_words_and_lines_of_ones_own():
-    branch = nsjax.continue_equilibrium(gallery.DiscontinuousSaddleNode(1.0), gallery.Line(1.0), "mu", (-1.0, 1.0))
+    branch = nsjax.continue_equilibrium(gallery.SaddleNode(1.0), gallery.Line(1.0), "mu", (-1.0, 1.0))
     (special,) = branch.special_points
     ax = plot.bifurcation_diagram(branch, names=lambda b: "f" if b is special else "", color="C1", linewidth=0.7)
     assert [text.get_text() for text in ax.texts] == ["f"]
