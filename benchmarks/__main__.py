@@ -1,4 +1,4 @@
-"""Every figure of benchmarks/README.md in one run, one after the other: about an hour.
+"""Every figure of benchmarks/README.md in one run, one after the other.
 
 python benchmarks
 """

@@ -120,10 +120,9 @@ def as_a_user(tmp_path, monkeypatch):
 
 QUICK = [name for name, path in DOCUMENTS.items() if any(not b.slow and not b.excerpt for b in blocks(path))]
 SLOW = [name for name, path in DOCUMENTS.items() if any(block.slow for block in blocks(path))]
-LONG = ("docs/guide/modelling.md", "docs/guide/tolerances.md")  # which take ten seconds, other pages two
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x in LONG)) for x in QUICK])
+@pytest.mark.parametrize("name", QUICK)
 def test_blocks_run(name, as_a_user):
     assert run(DOCUMENTS[name], slow=False)
 
