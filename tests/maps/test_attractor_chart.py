@@ -183,6 +183,7 @@ def test_mistakes():
         ({"a": [1.0], "middle": [0.5]}, dict(section=None), "autonomous: give a `section`"),
         ({"a": [1.0], "middle": [0.5]}, dict(max_period=0), "`max_period` must be"),
         ({"a": [1.0], "middle": [0.5]}, dict(chunk=0), "`chunk` must be"),
+        ({"a": [1.0], "middle": [0.5]}, dict(devices=2), "`devices` must be a number from 1 to 1, but is 2"),
     ):
         with pytest.raises((ValueError, TypeError), match=words):
             nsjax.attractor_chart(Logistic(), parameters, START, **BEATS | options)
