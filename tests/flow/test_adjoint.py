@@ -13,7 +13,6 @@ from nsjax import gallery, solve
 
 
 ADJOINTS = {"jacobian": dfx.DirectAdjoint(), "checkpoint": dfx.RecursiveCheckpointAdjoint()}
-SLOW_BY_STEPS = ["jacobian", pytest.param("checkpoint", marks=pytest.mark.slow)]
 CHEAP = dict(solver=dfx.Bosh3(), stepsize_controller=pid(1e-6), max_steps=256, max_events=16)
 
 
@@ -34,7 +33,8 @@ def forward():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ADJOINTS)
-def test_parameters_of_the_gallery(forward, adjoint):
+def test_reverse_is_forward_for_stick_slip(forward, adjoint):
+    """By initial state and three parameters of section 3.4."""
     backward = jax.jit(jax.jacrev(lambda p: stick_slip(p, ADJOINTS[adjoint])))(POINT)
     np.testing.assert_allclose(backward, forward, rtol=1e-10, atol=1e-10)
 
@@ -78,7 +78,7 @@ def learned_forward():
     return jax.jit(jax.jacfwd(lambda p: learned(p, dfx.ForwardMode())))(LEARNED)
 
 
-@pytest.mark.parametrize("adjoint", SLOW_BY_STEPS)
+@pytest.mark.parametrize("adjoint", ["jacobian", pytest.param("checkpoint", marks=pytest.mark.slow)])
 def test_reverse_is_forward(learned_forward, adjoint):
     """Sliding entry, static breakaway, event times; by initial state, parameters, and the numbers of a network, whose
     activation is a function that comes back with the solution's system."""

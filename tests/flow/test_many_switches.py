@@ -107,6 +107,8 @@ def test_a_scene_as_each_alone(singles):
 
     chain = with_slope(lambda v, *how: end(gallery.BlockChain(n=N, k_c=0.0, v_dr=v), *how))
     check(singles, chain(0.2, begin, 1e-11), lambda ys: jnp.stack(ys.q))
+    sol = jax.eval_shape(lambda: nsjax.solve(gallery.BlockChain(n=N), 0.0, 9.0, begin))
+    assert isinstance(sol.system, gallery.BlockChain)
 
 
 @pytest.mark.slow

@@ -65,6 +65,7 @@ def test_forced_for_long_in_single_precision(solver):
     exact = reference.simulate(reference.ImpactOscillator(**parameters), 100.0, tuple(y0))
     sol = solve(single(model), 0.0, 100.0, single(y0), solver=solver)
     assert sol.y1.x.dtype == jnp.float32 and len(exact.events) > 5
+    assert itinerary(sol) == [("wall", 0, 0)] * len(exact.events)
     np.testing.assert_allclose(times(sol), [float(e.t) for e in exact.events], atol=1e-4)
     np.testing.assert_allclose(flat(sol.y1), reference.floats(exact.y), atol=1e-4)
 

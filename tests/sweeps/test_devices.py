@@ -50,9 +50,11 @@ def test_two_devices(tmp_path):
 
 @pytest.mark.slow
 def test_charts_of_two_devices():
-    out, errors = begin("charts").communicate()
+    process = begin("charts")
+    out, errors = process.communicate()
+    assert process.returncode == 0, errors
     found = json.loads(out)
-    assert len(set(found["charts"])) == 1 and {"chaos", "period 1", "period 4"} <= set(found["kinds"]), errors
+    assert len(set(found["charts"])) == 1 and {"chaos", "period 1", "period 4"} <= set(found["kinds"])
 
 
 @pytest.mark.slow
