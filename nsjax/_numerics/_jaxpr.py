@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 
-_CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
+CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 # Each entry of the result depends on the same entry of the operands.
 ELEMENTWISE = frozenset(
     "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy cos cosh "
@@ -80,7 +80,7 @@ def _masks(jaxpr: Any, inputs: list[Mask], leapt: list[Mask] | None = None) -> t
         pairs, name = [read(v) for v in e.invars], e.primitive.name
         have, leaps = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
         inner = [p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr)]
-        if name in _CALLS and len(inner) == 1 and any(m.any() for m in have):
+        if name in CALLS and len(inner) == 1 and any(m.any() for m in have):
             out = _masks(inner[0].jaxpr, have, leaps)
         else:
             out = _passed_on(e, have), _passed_on(e, leaps)

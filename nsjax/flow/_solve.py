@@ -14,6 +14,7 @@ from jaxtyping import Array, Int
 
 from .._numerics._autodiff import dense_jacobian, forward_only, frozen
 from .._numerics._compile import interactive
+from .._numerics._first_pass import is_first_pass, left_over
 from .._numerics._jaxpr import bends_and_jumps, jumps
 from .._numerics._linalg import WRITTEN_OUT
 from .._numerics._merge import merged
@@ -50,11 +51,14 @@ class _Options(NamedTuple):
     throw: bool = False
     meter: dfx.AbstractProgressMeter = dfx.NoProgressMeter()
     still: bool = False  # whether only the state at the end has derivatives
+    plain: bool = False  # whether affine models go by plain events alone, and leave the rest over
 
 
 @interactive
-def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> Solution:
-    def run(system: System, t0: Scalar, t1: Scalar, y0: Y) -> Solution:
+def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> tuple[Solution, Any]:
+    """The solution, and whether it was left over; None if it could not be."""
+
+    def run(system: System, t0: Scalar, t1: Scalar, y0: Y) -> tuple[Solution, Any]:
         return _integrate(system, t0, t1, y0, options)
 
     if isinstance(options.integrator.adjoint, dfx.DirectAdjoint):
@@ -71,26 +75,31 @@ def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> So
     return run(system, t0, t1, y0)
 
 
-def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> Solution:
+def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> tuple[Solution, Any]:
     direction = jnp.where(t1 >= t0, 1, -1).astype(t0.dtype)
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
     model = SwitchedSystem(system.assembled(), direction, start, y0).at(start)
     state, forked, result = start_mode(model, start, y0, options.given, frozen(stop - start))
+    solver = options.integrator.solver
+    exact = (options.plain or isinstance(solver, Affine)) and allows(model, options.meter, state, start, y0)
+    plain = options.plain and exact
+    options = options._replace(integrator=options.integrator._replace(solver=Affine() if plain else solver))
     stepper = _stepper(options.integrator).made_for(model, state, start, y0)
     y0 = model.project(start, y0, state)  # a change of y0 off the surface that holds it changes nothing
     flow = _flow(model, stepper, (start, stop), y0, state, options)
     result = _obstacle(flow, y0, state, options.saveat, result)
     carry = _first_turn(flow, y0, state, forked, result, options)
     carry = _tied(jax.tree.map(_strong, carry), (system, t0, t1, y0))
-    exact = isinstance(options.integrator.solver, Affine) and allows(flow, state, start, y0)
-    c = exactly(flow, carry) if exact else _looped(flow, carry, options.integrator.adjoint)
+    c = exactly(flow, carry, plain) if exact else _looped(flow, carry, options.integrator.adjoint)
     sol = _solution(flow, c, t0, state, Request.of(options.saveat).t1)
+    if plain:  # what fails too is for the second pass to tell
+        return sol, ~is_okay(sol.result) | (c.t < flow.t1)
     if options.throw:
         # (What is transposed has been computed before.)
         failed = ~is_okay(sol.result)
         sol = sol.result.error_if(sol, failed) if flow.reverse else raise_if(failed, sol.result, sol)
-    return sol
+    return sol, None
 
 
 def _flow(
@@ -311,7 +320,7 @@ def solve(
     y0: StateT,
     *,
     mode: Mapping[str, Any] | Sequence[Any] | None = None,
-    solver: dfx.AbstractSolver = dfx.Tsit5(),
+    solver: dfx.AbstractSolver | None = None,
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     rtol: float | None = None,
     atol: float | None = None,
@@ -341,6 +350,8 @@ def solve(
         a repulsive surface that is reached is crossed, and a start on one is refused. `Solution.unique` tells.
     - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, Euler,
         `nsjax.Taylor`, or for models that are affine in the state `nsjax.Exponential` or, for sweeps, `nsjax.Affine`.
+        By default `diffrax.Tsit5()`, and within `nsjax.sweep` `nsjax.Affine()` for what that can do: where nothing is
+        said of steps either (by `stepsize_controller`, `dt0`, `SaveAt(steps=...)` or `SaveAt(dense=True)`).
     - `stepsize_controller`: by default `diffrax.PIDController` with `rtol = atol = 1e-8` (1e-5 for float32).
     - `rtol`, `atol`: relative and absolute tolerance of that default controller, if not these; not to be given together
         with `stepsize_controller`.
@@ -363,6 +374,10 @@ def solve(
     t0, y0, given = checked_start(system, t0, y0, mode)
     t1 = checked_time("t1", t1, t0.dtype)
     check_span(system, t0, t1, saveat)
+    wanted = saveat.dense or Request.of(saveat).steps
+    own = solver is None and stepsize_controller is None and dt0 is None and not wanted
+    plain = is_first_pass() and (own or isinstance(solver, Affine)) and isinstance(adjoint, dfx.ForwardMode)
+    solver = dfx.Tsit5() if solver is None else solver
     integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint).checked(
         t0.dtype, rtol=rtol, atol=atol
     )
@@ -376,9 +391,12 @@ def solve(
         dt0 = jnp.abs(jnp.asarray(dt0, t0.dtype))
     concrete = throw and known((system, t0, t1, y0, given, integrator, saveat, dt0))
     within = throw and not concrete  # raised by the compiled program itself
+    options = _Options(given, integrator, saveat, dt0, within, progress_meter, plain=plain)
+    sol, left = _run(system, t0, t1, y0, options)
+    if left is not None:
+        return left_over(left, sol)
     if len(system.switches) <= 1 and not isinstance(integrator.solver, Taylor | AbstractExponential):
         ask_for_whole_loops()  # (of more switches that takes 1.4 times as long to compile)
-    sol = _run(system, t0, t1, y0, _Options(given, integrator, saveat, dt0, within, progress_meter))
     if not concrete:
         return sol
     if not known(sol.result):  # numbers that are known, within a function that is being compiled
@@ -402,4 +420,4 @@ def integrate(
     """`solve` for arguments that have been checked, which never raises. `still`: only `y1` has derivatives, not what is
     saved or logged on the way, which makes a smaller program."""
     options = _Options(given_modes(system, mode), integrator.with_arrays(t0.dtype), saveat, still=still)
-    return _run(arrays_of(system, t0.dtype), t0, jnp.asarray(t1, t0.dtype), y0, options)
+    return _run(arrays_of(system, t0.dtype), t0, jnp.asarray(t1, t0.dtype), y0, options)[0]

@@ -23,9 +23,11 @@ ROWS = 1 << 20  # of an argument that are looked at together: it may lie on a di
 def fingerprint(fn: Callable[..., Any], lanes: Lanes, piece: Piece, block: int, names: list[str]) -> dict[str, Any]:
     """In JSON, by the names under which the differences are told. The program is what is compiled: whatever in `fn`, in
     the model or in the options makes another one of it makes another sweep; a comment or a name does not."""
-    program = hashlib.sha256(piece.program.text.encode())
-    for const in piece.program.consts:
-        program.update(_digest(const).encode())
+    program = hashlib.sha256()
+    for each in piece.programs:
+        program.update(each.text.encode())
+        for const in each.consts:
+            program.update(_digest(const).encode())
     own = jax.tree_util.tree_leaves_with_path(eqx.filter(fn, eqx.is_array))
     args = jax.tree_util.tree_leaves_with_path(eqx.filter((lanes.mapped, lanes.rest), _is_array))
     return {

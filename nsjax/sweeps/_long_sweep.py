@@ -118,7 +118,7 @@ class Sweep:
         chunk = max(1, min(chunk, lanes.number))  # of few lanes there are no more in a chunk
         chunks = -(-min(block, max(1, lanes.number)) // chunk)
         many = are_many(min(block, lanes.number))
-        self._piece = Piece(fn, lanes, chunk, min(MOST, chunks), self._devices, many)
+        self._piece = Piece(fn, lanes, chunk, min(MOST, chunks), self._devices, many=many)
         self._lanes = lanes.on_host()
         self._owner = myself()
         self._folder = Folder(path, self._owner.token)

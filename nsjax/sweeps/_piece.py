@@ -5,7 +5,7 @@ import contextlib
 import functools as ft
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,8 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 
-from .._numerics._compile import without_collection
+from .._numerics._compile import swept, without_collection
+from .._numerics._first_pass import first_pass, told, UnreachableError
 from .._numerics._whole_loops import on_request, Request
 from ._devices import Device
 from ._lanes import Lanes
@@ -32,23 +33,52 @@ class Piece:
     """Up to `chunks` chunks of `chunk` lanes, as many as there are.
 
     The program does not know how many lanes there are in all (but that there are `many`), nor who computes the others.
-    So a lane has the same bits whichever device, thread or process it falls to, and whatever was done before.
+    So a lane has the same bits whichever device, thread or process it falls to, and whatever was done before. What the
+    `first` pass leaves over is computed `again`, by another program.
     """
 
     def __init__(
-        self, fn: Callable[..., Any], lanes: Lanes, chunk: int, chunks: int, devices: Sequence[Device], many: bool
+        self,
+        fn: Callable[..., Any],
+        lanes: Lanes,
+        chunk: int,
+        chunks: int,
+        devices: Sequence[Device],
+        *,
+        many: bool,
+        first: bool = True,
     ):
         self.chunk, self.size, self.platform = chunk, chunk * chunks, devices[0].platform
         # What is the same for all pieces is brought to each device once.
         self._shared, static = eqx.partition((fn, lanes.rest), eqx.is_array)
         self._there: dict[Device, Any] = {}
-        how = chunk, chunks, tuple(devices), many
-        self.program = _program_for(static, self._shared, lanes.mapped, how)
+        found = ft.partial(_program_for, static, self._shared, lanes.mapped, _How(chunk, chunks, tuple(devices), many))
+        self.program = found(first)
+        self.again = found(False) if self.program.tells else None
+
+    @property
+    def programs(self) -> list["Program"]:
+        return [self.program] if self.again is None else [self.program, self.again]
 
     def run(self, mapped: Any, device: Device) -> list[np.ndarray]:
         """The leaves of what `fn` returns, for up to `size` lanes. Each device has a thread that calls it."""
+        if self.again is None:
+            return self._run(self.program, mapped, device)
+        try:
+            *leaves, left = self._run(self.program, mapped, device)
+        except RuntimeError:  # of a lane that is left over, perhaps: a check of the user's own
+            return self._run(self.again, mapped, device)
+        which = np.flatnonzero(left)
+        if len(which):
+            leaves = [leaf.copy() for leaf in leaves]
+            more = self._run(self.again, jax.tree.map(lambda x: x[which], mapped), device)
+            for leaf, part in zip(leaves, more, strict=True):
+                leaf[which] = part
+        return leaves
+
+    def _run(self, program: "Program", mapped: Any, device: Device) -> list[np.ndarray]:
         number = len(jax.tree.leaves(mapped)[0])
-        compiled = self.program.on(device)
+        compiled = program.on(device)
         if device not in self._there:
             self._there[device] = jax.device_put(self._shared, device)
         full = jax.tree.map(lambda x: jax.device_put(_filled(x, self.size), device), mapped)
@@ -72,6 +102,7 @@ class Program:
 
     - `text`, `consts`: it, and the arrays that it holds.
     - `tree`, `forms`: the structure of what `fn` returns, and the shapes and dtypes of its leaves for one lane.
+    - `tells`: whether it returns beside that which lanes it has left over.
     """
 
     def __init__(self, function: Callable[..., Any], forms: Any, devices: Sequence[Device], many: bool):
@@ -87,7 +118,9 @@ class Program:
             traced = [jitted.trace(*placed(device)) for device in devices]
             lowered = [one.lower() for one in traced]
         self.consts, self._first = traced[0].jaxpr.consts, lowered[0]
-        out, self.tree = jax.tree.flatten(lowered[0].out_info)
+        result, left = lowered[0].out_info
+        self.tells = left is not None
+        out, self.tree = jax.tree.flatten(result)
         self.forms = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in out]
         if any(jnp.issubdtype(form.dtype, jax.dtypes.extended) for form in self.forms):
             raise TypeError("What `fn` returns must be numbers: of a random key return `jax.random.key_data(key)`.")
@@ -104,16 +137,22 @@ class Program:
         with self._locks[device]:
             if device not in self._compiled:
                 with self._on_request():
-                    self._compiled[device] = self._lowered.pop(device).compile()
+                    self._compiled[device] = self._lowered.pop(device).compile(swept())
             return self._compiled[device]
+
+
+class _How(NamedTuple):
+    chunk: int
+    chunks: int
+    devices: tuple[Device, ...]
+    many: bool
 
 
 _kept: collections.OrderedDict[Any, Program] = collections.OrderedDict()
 
 
-def _program_for(static: Any, shared: Any, mapped: Any, how: tuple[int, int, tuple[Device, ...], bool]) -> Program:
+def _program_for(static: Any, shared: Any, mapped: Any, how: _How, first: bool) -> Program:
     """The one of an earlier call, where all is the same, as `jax.jit` would have it."""
-    chunk, chunks, devices, many = how
 
     def form(x: Any) -> jax.ShapeDtypeStruct:
         aval = jax.typeof(x)
@@ -121,30 +160,38 @@ def _program_for(static: Any, shared: Any, mapped: Any, how: tuple[int, int, tup
 
     def rows(x: Any) -> jax.ShapeDtypeStruct:
         one = form(x[:0])
-        return jax.ShapeDtypeStruct((chunk * chunks, *one.shape[1:]), one.dtype, weak_type=one.weak_type)
+        return jax.ShapeDtypeStruct((how.chunk * how.chunks, *one.shape[1:]), one.dtype, weak_type=one.weak_type)
+
+    def made() -> Program:
+        if first:
+            with contextlib.suppress(UnreachableError), first_pass():
+                return Program(_function(static, how, told), forms, how.devices, how.many)
+        return Program(_function(static, how, lambda fn: lambda *args: (fn(*args), None)), forms, how.devices, how.many)
 
     forms = jax.tree.map(form, shared), jax.tree.map(rows, mapped), form(np.int32(0))
     (own, own_tree), (flat, tree) = jax.tree.flatten(static), jax.tree.flatten(forms)
     types = tuple((x.shape, x.dtype, x.weak_type) for x in flat)
     # (Of a number with its type: True is 1, and another program.)
     settings = trace_context() if trace_context is not None else jnp.result_type(float)
-    key = tuple((type(x), x) for x in own), own_tree, types, tree, how, settings
+    key = tuple((type(x), x) for x in own), own_tree, types, tree, how, first, settings
     try:
         found = _kept.pop(key, None)
     except TypeError:  # the function holds what cannot be compared
-        return Program(_function(static, chunk, chunks), forms, devices, many)
-    program = found or Program(_function(static, chunk, chunks), forms, devices, many)
+        return made()
+    program = found or made()
     _kept[key] = program
     while len(_kept) > KEPT:
         _kept.popitem(last=False)
     return program
 
 
-def _function(static: Any, chunk: int, chunks: int) -> Callable[..., Any]:
+def _function(static: Any, how: _How, wrap: Callable[..., Any]) -> Callable[..., Any]:
+    chunk, chunks = how.chunk, how.chunks
+
     def piece(shared: Any, mapped: Any, count: Any) -> Any:
         fn, rest = eqx.combine(shared, static)
         # (As a program of its own it is traced once, though it is asked for its shapes first.)
-        lanes = jax.jit(jax.vmap(lambda mapped: fn(*eqx.combine(mapped, rest))))
+        lanes = jax.jit(jax.vmap(lambda mapped: wrap(fn)(*eqx.combine(mapped, rest))))
         if chunks == 1:
             return lanes(mapped)
 

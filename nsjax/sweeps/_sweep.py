@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from .._numerics._compile import eager, long_running
+from .._numerics._compile import eager, interactive, long_running, MANY
+from .._numerics._first_pass import first_pass, told, UnreachableError
 from .._numerics._progress import Counting, ProgressMeter, QUIET, Told
 from .._numerics._text import known, positive
 from .._numerics._whole_loops import on_request
@@ -25,6 +26,14 @@ PIECES = 64  # of a sweep, from which on a piece is of several chunks: each cost
 Tell = Callable[[int], Any]
 
 _run = long_running(in_chunks)
+_few = interactive(in_chunks, host=True)
+
+
+@long_running
+def _first(fn: Callable[..., Any], mapped: Any, rest: Any, chunk: int) -> tuple[Any, Any]:
+    """What a small program makes of it, and which lanes it leaves over; None if there can be none."""
+    with first_pass():
+        return in_chunks(told(fn), mapped, rest, chunk)
 
 
 def sweep(
@@ -85,7 +94,43 @@ def sweep(
     if chunk is None:
         chunk = default_chunk(lanes.number, jax.default_backend())
     with on_request() if are_many(lanes.number) else contextlib.nullcontext():
+        if lanes.number and eager() and known((fn, lanes)):
+            with contextlib.suppress(UnreachableError):
+                return _in_passes(fn, lanes, chunk)
         return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, chunk)
+
+
+def _in_passes(fn: Callable[..., Any], lanes: Lanes, chunk: int) -> Any:
+    """By a small program, if there is one for what `fn` does, and by the whole one those lanes that it leaves over."""
+    mapped = jax.tree.map(jnp.asarray, lanes.mapped)
+    try:
+        out, left = _first(fn, mapped, lanes.rest, chunk)
+        which = [] if left is None else np.flatnonzero(left)
+    except RuntimeError:  # of a lane that is left over, perhaps: a check of the user's own
+        _, left = jax.eval_shape(lambda mapped: _first(fn, mapped, lanes.rest, chunk), mapped)
+        if left is None:
+            raise
+        return _run(fn, mapped, lanes.rest, chunk)
+    if not len(which):
+        return out
+    if any(jnp.issubdtype(x.dtype, jax.dtypes.extended) for x in jax.tree.leaves(out)):  # random keys
+        return _run(fn, mapped, lanes.rest, chunk)
+    found = _again(fn, Lanes(lanes.on_host().rows(which), lanes.rest, len(which)), even_chunks(lanes.number, chunk)[1])
+
+    def completed(all: Any, some: Any) -> Any:
+        whole = np.array(all)
+        whole[which] = some
+        return jnp.asarray(whole)
+
+    return jax.tree.map(completed, out, found)
+
+
+def _again(fn: Callable[..., Any], lanes: Lanes, chunk: int) -> Any:
+    """By the whole program, whatever their number: compiled quickly, if they are few."""
+    if lanes.number > MANY:
+        return in_pieces(fn, lanes, chunk, 1, devices_of(None), many=are_many(lanes.number), first=False)
+    filled = lanes.rows(np.minimum(np.arange(MANY), lanes.number - 1))
+    return jax.tree.map(lambda x: x[: lanes.number], _few(fn, jax.tree.map(jnp.asarray, filled), lanes.rest, MANY))
 
 
 def _counted(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices: Any, meter: ProgressMeter) -> Any:
@@ -124,11 +169,12 @@ def in_pieces(
     tell: Tell | None = None,
     *,
     many: bool,
+    first: bool = True,
 ) -> Any:
     """Pieces of so many chunks `together`, each on the device that is free first. `tell` is called with the number of
-    lanes that are done. Of `many` the program may take longer to compile."""
+    lanes that are done. Of `many` the program may take longer to compile. A `first` pass may do with a smaller one."""
     found = found[: -(-lanes.number // (chunk * together))]  # a device without a piece needs no program
-    piece, lanes = Piece(fn, lanes, chunk, together, found, many), lanes.on_host()
+    piece, lanes = Piece(fn, lanes, chunk, together, found, many=many, first=first), lanes.on_host()
     out = [np.empty((lanes.number, *form.shape), form.dtype) for form in piece.program.forms]
     starts = range(0, lanes.number, piece.size)
     with DeviceQueue(found) as each:

@@ -25,8 +25,9 @@ _IN_CACHE = 256, 2**20  # lanes that are run together, at most, and bytes of the
 _IN_MEMORY = 65_536, 2**30  # and on other devices, which want many lanes at once
 
 
-def exactly(flow: Flow, carry: Carry) -> Carry:
-    """The end of the loop, as `_solve._looped` finds it, for a model that `_plan.allows`."""
+def exactly(flow: Flow, carry: Carry, plain: bool = False) -> Carry:
+    """The end of the loop, as `_solve._looped` finds it, for a model that `_plan.allows`; or if only what is `plain` is
+    wanted, the end of that."""
     first = carry.state
     plan = made(flow, first, carry.t, carry.y)
     kept = min(numbers(flow.model), _KEPT)
@@ -37,12 +38,12 @@ def exactly(flow: Flow, carry: Carry) -> Carry:
 
     def run(dynamic: Any) -> Any:
         flow, carry = eqx.combine(dynamic, static)
-        return eqx.filter(_run(flow, plan, kept, carry), eqx.is_array)
+        return eqx.filter(_run(flow, plan, kept, carry, plain), eqx.is_array)
 
     return eqx.combine(in_lanes(run, chunk, dynamic), static[1])
 
 
-def _run(flow: Flow, plan: Plan, kept: int, carry: Carry) -> Carry:
+def _run(flow: Flow, plan: Plan, kept: int, carry: Carry, plain: bool) -> Carry:
     found = by_lane(lambda flow, y: constants(flow, plan, y), flow, carry.y)
     problem = Problem(flow, plan, found, carry.y, PHASE if saves(flow) else THETA)
     table = _blank(problem, kept, carry)
@@ -59,7 +60,10 @@ def _run(flow: Flow, plan: Plan, kept: int, carry: Carry) -> Carry:
         carry, lane, table, used = eqx.combine(dynamic, static)
         table, used, lane = _tabulated(problem, table, used, lane)
         lane = _arcs(problem, table, lane)
-        carry, lane = _general(problem, table, carry, lane)
+        if plain:
+            lane = lane._replace(active=lane.active & ~lane.slow)
+        else:
+            carry, lane = _general(problem, table, carry, lane)
         return eqx.filter((carry, lane, table, used), eqx.is_array)
 
     carry, lane, table, _ = eqx.combine(lax.while_loop(busy, body, dynamic), static)

@@ -74,14 +74,13 @@ class Problem(NamedTuple):
     theta: float  # the phase that an arc may pass through
 
 
-def allows(flow: Flow, state: ModeState, t: Scalar, y: Y) -> bool:
+def allows(model: SwitchedSystem, meter: dfx.AbstractProgressMeter, state: ModeState, t: Scalar, y: Y) -> bool:
     """Whether a model is affine in every mode, with no other switches than `sgn` and `impact` with one h each, none of
     which acts on the surface of another one. (Of friction beside a wall, or of three coupled surfaces, a third of the
     events are not plain, and sweeps took up to twice the time of the general flow.)"""
-    model = flow.model
     if not all(model.apart):
         return False
-    if flow.reverse or not isinstance(flow.meter, dfx.NoProgressMeter) or len(model.switches) > MOST_SWITCHES:
+    if not isinstance(meter, dfx.NoProgressMeter) or len(model.switches) > MOST_SWITCHES:
         return False
     for k, switch in enumerate(model.switches):
         smooth = model.parts[k] == 1 and not switch.condition

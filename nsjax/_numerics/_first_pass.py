@@ -1,0 +1,108 @@
+"""Lanes that a small program leaves over, for a larger one that is compiled only if there are any.
+
+What is traced within `first_pass` may say of a lane that it has not worked it out (`left_over`). Whoever calls it takes
+what it returns by `told`, which returns beside it whether anything in the lane was left over, and computes such lanes
+again, without a first pass.
+"""
+
+import functools as ft
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.extend.core as jex
+import jax.numpy as jnp
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Bool
+
+from ._jaxpr import CALLS
+
+
+# (JAX keeps what is traced in one such context apart from what is traced in another.)
+_first = jax.make_user_context(default_value=False)
+
+left_over_p = jex.Primitive("left_over")
+left_over_p.multiple_results = True
+
+
+class UnreachableError(Exception):
+    """Something was left over where nobody can tell: in a loop or a branch of the function."""
+
+
+def first_pass() -> AbstractContextManager[None]:
+    return _first(True)
+
+
+def is_first_pass() -> bool:
+    return bool(_first.value)
+
+
+def left_over(when: Bool[Array, ""], tree: Any) -> Any:
+    """`tree`, on whose arrays whatever is made of them depends, so that what is said of it is not lost."""
+    dynamic, static = eqx.partition(tree, eqx.is_array)
+    flat, form = jax.tree.flatten(dynamic)
+    return eqx.combine(jax.tree.unflatten(form, left_over_p.bind(when, *flat)), static)
+
+
+def _batch(args: Any, dims: Any) -> tuple[list[Any], list[Any]]:
+    when, dim = args[0], dims[0]
+    if dim is not None:  # a batch within the lane
+        when = jnp.any(when, axis=dim)
+    return left_over_p.bind(when, *args[1:]), list(dims[1:])
+
+
+def _jvp(primals: Any, tangents: Any) -> tuple[list[Any], list[Any]]:
+    return left_over_p.bind(*primals), list(tangents[1:])
+
+
+left_over_p.def_impl(lambda when, *xs: list(xs))
+left_over_p.def_abstract_eval(lambda when, *xs: list(xs))
+batching.primitive_batchers[left_over_p] = _batch
+ad.primitive_jvps[left_over_p] = _jvp
+mlir.register_lowering(left_over_p, lambda ctx, when, *xs: list(xs))
+
+
+def told(fn: Callable[..., Any]) -> Callable[..., tuple[Any, Bool[Array, ""] | None]]:
+    """What `fn` returns, and whether anything was left over; None if nothing could be. Raises `UnreachableError`."""
+
+    def call(*args: Any) -> tuple[Any, Any]:
+        dynamic, static = eqx.partition(args, eqx.is_array)
+        flat, tree = jax.tree.flatten(dynamic)
+        closed, form = jax.make_jaxpr(
+            lambda *xs: fn(*eqx.combine(jax.tree.unflatten(tree, xs), static)), return_shape=True
+        )(*flat)
+        said: list[Any] = []
+        out = _evaluated(closed.jaxpr, [*closed.consts, *flat], said)
+        return jax.tree.unflatten(jax.tree.structure(form), out), ft.reduce(jnp.logical_or, said) if said else None
+
+    return call
+
+
+def _says(jaxpr: jex.Jaxpr) -> bool:
+    """Whether a program may leave something over."""
+    return any(e.primitive is left_over_p or any(map(_says, jex.jaxprs_in_params(e.params))) for e in jaxpr.eqns)
+
+
+def _evaluated(jaxpr: jex.Jaxpr, values: list[Any], said: list[Any]) -> list[Any]:
+    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], values))
+
+    def read(v: Any) -> Any:
+        return v.val if isinstance(v, jex.Literal) else env[v]
+
+    for e in jaxpr.eqns:
+        x = [read(v) for v in e.invars]
+        if e.primitive is left_over_p:
+            said.append(x[0])
+            out = x[1:]
+        elif any(map(_says, jex.jaxprs_in_params(e.params))):
+            if e.primitive.name not in CALLS:
+                raise UnreachableError
+            (inner,) = (p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr))
+            out = _evaluated(inner.jaxpr, [*inner.consts, *x], said)
+        else:
+            out = e.primitive.bind(*x, **e.primitive.get_bind_params(e.params))
+            out = out if e.primitive.multiple_results else [out]
+        env.update(zip(e.outvars, out))
+    return [read(v) for v in jaxpr.outvars]

@@ -1,0 +1,167 @@
+"""A sweep of affine models by plain events; what is not plain is computed by the general flow."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import flat, Motion
+
+import nsjax
+from nsjax import gallery, sweep
+
+
+class Ball(nsjax.System):
+    """A ball on the ground: bounces, and for e < 1 comes to rest at t = v/g (1 + e) / (1 - e) after a throw from it."""
+
+    e: float = 0.5
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -1.0 + s.ground)
+
+    @nsjax.impact
+    def ground(self, t, y):
+        return y.x
+
+    @ground.restitution
+    def ground(self):
+        return self.e
+
+
+E = jnp.asarray([1.0, 0.9, 0.5, 0.3, 0.999])
+PLAIN = np.asarray([True, True, False, False, True])  # those that do not come to rest until t = 4
+
+
+def thrown(e, **how):
+    """From a height of 1/2, to t = 4."""
+    sol = nsjax.solve(Ball(e=e), 0.0, 4.0, Motion(0.5, 0.0), throw=False, **how)
+    return sol.y1, sol.result, sol.events.num, sol.stats["num_steps"]
+
+
+def height(e, t=4.0):
+    """In closed form."""
+    at, v = 1.0, e  # of the first impact, and after it
+    while t - at > 2 * v > 1e-12:
+        at, v = at + 2 * v, e * v
+    return v * (t - at) - (t - at) ** 2 / 2 if v > 1e-9 else 0.0
+
+
+@pytest.fixture(scope="module")
+def found():
+    return sweep(thrown, E)
+
+
+def test_exact_where_it_is_plain(found):
+    """In as many steps as arcs; and right where it is not."""
+    y1, result, events, steps = found
+    error = np.abs(np.asarray(y1.x) - [height(float(e)) for e in E])
+    assert np.all(error[PLAIN] < 1e-13) and np.all(error < 1e-7)
+    assert np.all(result == nsjax.RESULTS.successful)
+    np.testing.assert_array_equal(np.asarray(steps == events + 1), PLAIN)
+
+
+@pytest.mark.slow
+def test_in_pieces(found):
+    """On devices that are named the same lanes are left over."""
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(sweep(thrown, E, devices=1)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "how", [dict(solver=dfx.Tsit5()), dict(dt0=0.1), dict(stepsize_controller=dfx.ConstantStepSize(), dt0=0.125)]
+)
+def test_what_is_said_of_steps(found, how):
+    """Holds: the same number of them as without a sweep."""
+    for a, b in zip(
+        jax.tree.leaves(sweep(lambda e: thrown(e, **how), E)), jax.tree.leaves(jax.vmap(lambda e: thrown(e, **how))(E))
+    ):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+
+
+def stuck(v_dr, x0, **how):
+    """Stick-slip from where the belt holds the block: at x0 = 2 at the bound of static friction."""
+    return nsjax.solve(gallery.StickSlip(v_dr=v_dr), 0.0, 20.0, Motion(x0, v_dr), throw=False, **how)
+
+
+@pytest.mark.slow
+def test_derivatives_of_what_is_left_over():
+    """By the start: two lanes at the bound of static friction among others."""
+    x0 = jnp.asarray([0.5, 2.0, 1.0, 2.0, -1.5])
+
+    def slope(x0, **how):
+        return jax.jacfwd(lambda x0: stuck(0.3, x0, **how).y1)(x0)
+
+    want = jax.vmap(lambda x0: slope(x0, rtol=1e-11, atol=1e-11))(x0)
+    np.testing.assert_allclose(flat(sweep(slope, x0)), flat(want), rtol=1e-7, atol=1e-8)
+
+
+def test_failures_are_told():
+    """By the general flow, which raises what it does of them."""
+
+    def lane(e):
+        return nsjax.solve(Ball(e=e), 0.0, 4.0, Motion(0.5, 0.0), max_events=3).y1
+
+    with pytest.raises(RuntimeError, match="maximum number of events"):
+        jax.block_until_ready(sweep(lane, E))
+
+
+@pytest.mark.slow
+def test_statuses():
+    """Those of the general flow."""
+    _, result, *_ = sweep(lambda e: thrown(e, max_events=3), E)
+    few = result == nsjax.RESULTS.max_events_reached
+    np.testing.assert_array_equal(np.asarray(few), [False, False, True, True, False])
+
+
+@pytest.mark.slow
+def test_checks_of_the_users_own():
+    """One that holds of solutions must not fail of a lane that is left over; one that does not is raised."""
+
+    def checked(limit):
+        def lane(e):
+            sol = nsjax.solve(Ball(e=e), 0.0, 4.0, Motion(0.5, 0.0), throw=False)
+            return eqx.error_if(sol.y1.x, sol.t1 < limit, "it has not come to its end")
+
+        return lane
+
+    x = sweep(checked(4.0), E)
+    np.testing.assert_allclose(x, [height(float(e)) for e in E], atol=1e-7)
+    with pytest.raises(RuntimeError, match="not come to its end"):
+        jax.block_until_ready(sweep(checked(5.0), E))
+
+
+@pytest.mark.slow
+def test_where_it_cannot_be_told():
+    """A solution in a loop, or beside a random key, is computed by the general flow for all lanes."""
+
+    def twice(e):
+        return jax.lax.fori_loop(0, 2, lambda _, x: nsjax.solve(Ball(e=e), 0.0, 0.5, Motion(x, 0.0)).y1.x, 0.5)
+
+    np.testing.assert_allclose(sweep(twice, E), 0.25, atol=1e-9)
+    keys = jax.random.split(jax.random.key(0), len(E))
+    same, (y1, *_) = sweep(lambda key, e: (key, thrown(e)), keys, E)
+    assert jnp.all(jax.random.key_data(same) == jax.random.key_data(keys))
+    np.testing.assert_allclose(y1.x, [height(float(e)) for e in E], atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ts", "steps", "dense"])
+def test_saving(kind):
+    """Steps are those of a solver, and dense output that of one: they are the default one's then."""
+    ts = jnp.linspace(0, 4, 9)
+    saveat = dfx.SaveAt(ts=ts) if kind == "ts" else dfx.SaveAt(t1=True, **{kind: True})
+
+    def lane(e):
+        more = dict(throw=False, max_steps=256, max_events=64)
+        return nsjax.solve(Ball(e=e), 0.0, 4.0, Motion(0.5, 0.0), saveat=saveat, **more)
+
+    sol = sweep(lane, E)
+    if kind == "ts":
+        want = [[height(float(e), float(t)) if t > 1 else 0.5 - t**2 / 2 for t in ts] for e in E]
+        np.testing.assert_allclose(sol.ys.x, want, atol=1e-6)
+        steps = np.asarray(sol.stats["num_steps"] == sol.events.num + 1)
+        np.testing.assert_array_equal(steps, PLAIN)
+    else:
+        np.testing.assert_array_equal(sol.stats["num_steps"], jax.vmap(lane)(E).stats["num_steps"])
