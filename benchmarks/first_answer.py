@@ -104,7 +104,7 @@ def branch() -> Callable[[], Any]:
     return follow
 
 
-def sweep(solver: str) -> Callable[[], Any]:
+def sweep(solver: str | None = None) -> Callable[[], Any]:
     import diffrax
     import jax.numpy as jnp
     from sweep import slider_lane
@@ -114,7 +114,7 @@ def sweep(solver: str) -> Callable[[], Any]:
 
     jax = jax_ready()
     values = jnp.asarray(WORKLOADS["S1"].sweep(4096))
-    method = nsjax.Taylor() if solver == "Taylor" else diffrax.Dopri8()
+    method = {None: None, "Dopri8": diffrax.Dopri8(), "Taylor": nsjax.Taylor()}[solver]
 
     def lane(v_dr: Any) -> Any:
         return slider_lane(v_dr, tol=1e-10, solver=method)
@@ -160,6 +160,7 @@ ROWS: dict[str, Callable[[], Callable[[], Any]]] = {
     "nsjax: find_orbit, 3.4": lambda: found("3.4"),
     "nsjax: find_orbit, 6.6": lambda: found("6.6"),
     "nsjax: find_orbit and continue_orbit, 6.6": branch,
+    "nsjax: sweep, S1, 4096 lanes": sweep,
     "nsjax: sweep, S1, 4096 lanes, Dopri8": lambda: sweep("Dopri8"),
     "nsjax: sweep, S1, 4096 lanes, Taylor": lambda: sweep("Taylor"),
     "heyoka: a solution to one event": heyoka_event,

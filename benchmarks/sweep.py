@@ -47,10 +47,9 @@ class Hammer(nsjax.System):
 # What a user of nsjax writes for one lane: the final state or its derivative, and whether it succeeded.
 
 
-def final(system: nsjax.System, y0: Motion, tol: float, solver: diffrax.AbstractSolver) -> tuple[Motion, jax.Array]:
-    controller = diffrax.PIDController(rtol=tol, atol=tol)
+def final(system: nsjax.System, y0: Motion, tol: float, **how: Any) -> tuple[Motion, jax.Array]:
     limits = dict(max_events=32, max_steps=100_000, throw=False)
-    sol = nsjax.solve(system, 0.0, T1, y0, solver=solver, stepsize_controller=controller, **limits)
+    sol = nsjax.solve(system, 0.0, T1, y0, rtol=tol, atol=tol, **limits, **how)
     return sol.y1, nsjax.is_okay(sol.result)
 
 
@@ -84,13 +83,13 @@ def own_codes(workload: str, tols: list[float], values: np.ndarray, batch: int |
     by_hand, model = LANES[workload]
     lines = count_lines((model, final, by_hand))
     codes = []
-    for solver in (diffrax.Tsit5(), diffrax.Dopri8(), nsjax.Taylor(), nsjax.Exponential(), nsjax.Affine()):
+    for solver in (None, diffrax.Tsit5(), diffrax.Dopri8(), nsjax.Taylor(), nsjax.Exponential()):
 
-        def lane(p: jax.Array, tol: jax.Array, solver: diffrax.AbstractSolver = solver) -> Any:
+        def lane(p: jax.Array, tol: jax.Array, solver: diffrax.AbstractSolver | None = solver) -> Any:
             return by_hand(p, tol=tol, solver=solver)
 
-        name = in_chunks(f"nsjax {type(solver).__name__}", batch)
-        for tol in [min(tols)] if isinstance(solver, nsjax.Exponential | nsjax.Affine) else tols:
+        name = in_chunks("nsjax" if solver is None else f"nsjax {type(solver).__name__}", batch)
+        for tol in [min(tols)] if solver is None or isinstance(solver, nsjax.Exponential) else tols:
             run = ft.partial(nsjax.sweep, lane, lanes, jnp.asarray(tol), chunk=batch or len(values))
             codes.append(Code(name, tol, values, lines, lambda run=run: run, unpack_checked))
     return codes

@@ -13,10 +13,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.extend.core as jex
+import jax.lax as lax
 import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool
 
+from ._inner import scan_counts
 from ._jaxpr import CALLS
 
 
@@ -28,7 +30,7 @@ left_over_p.multiple_results = True
 
 
 class UnreachableError(Exception):
-    """Something was left over where nobody can tell: in a loop or a branch of the function."""
+    """Something was left over where nobody can tell, or where it could keep a loop from coming to its end."""
 
 
 def first_pass() -> AbstractContextManager[None]:
@@ -85,6 +87,36 @@ def _says(jaxpr: jex.Jaxpr) -> bool:
     return any(e.primitive is left_over_p or any(map(_says, jex.jaxprs_in_params(e.params))) for e in jaxpr.eqns)
 
 
+def _called(e: Any, x: list[Any], said: list[Any]) -> list[Any]:
+    """What an operation with programs of its own returns, some of which say something."""
+
+    def of(closed: jex.ClosedJaxpr, *x: Any) -> tuple[list[Any], Any]:
+        own: list[Any] = [jnp.zeros((), bool)]
+        out = _evaluated(closed.jaxpr, [*closed.consts, *x], own)
+        return out, ft.reduce(jnp.logical_or, own)
+
+    if e.primitive.name in CALLS:
+        (inner,) = (p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr))
+        out, own = of(inner, *x)
+    elif e.primitive.name == "cond":
+        out, own = lax.switch(x[0], [ft.partial(of, branch) for branch in e.params["branches"]], *x[1:])
+    elif e.primitive.name == "scan":
+        consts, carried = scan_counts(e.params)
+        begin, rows = x[consts : consts + carried], x[consts + carried :]
+
+        def turn(carry: list[Any], row: list[Any]) -> tuple[list[Any], tuple[list[Any], Any]]:
+            out, own = of(e.params["jaxpr"], *x[:consts], *carry, *row)
+            return out[:carried], (out[carried:], own)
+
+        keep = {name: e.params[name] for name in ("length", "reverse", "unroll")}
+        end, (more, each) = lax.scan(turn, begin, rows, **keep)
+        out, own = [*end, *more], jnp.any(each)
+    else:
+        raise UnreachableError
+    said.append(own)
+    return out
+
+
 def _evaluated(jaxpr: jex.Jaxpr, values: list[Any], said: list[Any]) -> list[Any]:
     env = dict(zip([*jaxpr.constvars, *jaxpr.invars], values))
 
@@ -97,10 +129,7 @@ def _evaluated(jaxpr: jex.Jaxpr, values: list[Any], said: list[Any]) -> list[Any
             said.append(x[0])
             out = x[1:]
         elif any(map(_says, jex.jaxprs_in_params(e.params))):
-            if e.primitive.name not in CALLS:
-                raise UnreachableError
-            (inner,) = (p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr))
-            out = _evaluated(inner.jaxpr, [*inner.consts, *x], said)
+            out = _called(e, x, said)
         else:
             out = e.primitive.bind(*x, **e.primitive.get_bind_params(e.params))
             out = out if e.primitive.multiple_results else [out]

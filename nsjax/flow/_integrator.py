@@ -8,22 +8,24 @@ import jax.numpy as jnp
 from diffrax._root_finder import use_stepsize_tol
 from jax.core import Tracer
 
-from .steppers._exponential import AbstractExponential
+from .._numerics._first_pass import is_first_pass
+from .steppers._exponential import AbstractExponential, Affine
 
 
 class Integrator(NamedTuple):
     """Those arguments of `solve` that say how, and not what."""
 
-    solver: dfx.AbstractSolver
-    stepsize_controller: Any  # None until `checked`: by default
+    solver: Any  # until `checked` None, by default
+    stepsize_controller: Any  # the same
     max_steps: int = 4096
     max_events: int = 256
     adjoint: dfx.AbstractAdjoint = dfx.ForwardMode()
+    open: bool = False  # whether nothing was said of solver and steps, so that another method may be taken
 
     @property
     def arguments(self) -> dict[str, Any]:
         """Those of `solve`."""
-        return self._asdict()
+        return {name: value for name, value in self._asdict().items() if name != "open"}
 
     def checked(
         self,
@@ -32,6 +34,7 @@ class Integrator(NamedTuple):
         *,
         rtol: Any = None,
         atol: Any = None,
+        default: dfx.AbstractSolver = dfx.Tsit5(),
     ) -> "Integrator":
         """The same with a step size controller and a solver in the form that the loop needs.
 
@@ -40,8 +43,9 @@ class Integrator(NamedTuple):
         - `dtype`: that of the state.
         - `tolerance`: the default, in double and in single precision.
         - `rtol`, `atol`: those of the default controller, in place of `tolerance`.
+        - `default`: the solver, if none is given.
         """
-        solver, adjoint = self.solver, self.adjoint
+        solver, adjoint = default if self.solver is None else self.solver, self.adjoint
         if not isinstance(solver, dfx.AbstractSolver):
             raise TypeError(
                 f"Argument `solver` must be a diffrax solver such as `diffrax.Tsit5()`, but got {solver!r}."
@@ -55,7 +59,17 @@ class Integrator(NamedTuple):
                 "matrix exponential is a loop of unknown length; use `diffrax.DirectAdjoint()`."
             )
         controller = _controller(self.stepsize_controller, dtype, tolerance, dict(rtol=rtol, atol=atol))
-        return self._replace(solver=_implicit(solver, controller, adjoint), stepsize_controller=controller)
+        solver, nothing = (
+            _implicit(solver, controller, adjoint),
+            self.solver is None and self.stepsize_controller is None,
+        )
+        return self._replace(solver=solver, stepsize_controller=controller, open=nothing)
+
+    @property
+    def may_be_plain(self) -> bool:
+        """Whether a first pass may take the exact flow of affine models."""
+        taken = self.open or isinstance(self.solver, Affine)
+        return is_first_pass() and taken and isinstance(self.adjoint, dfx.ForwardMode)
 
     def with_arrays(self, dtype: Any) -> "Integrator":
         """The same with tolerances that are arrays, so that a new one is no new program."""

@@ -206,8 +206,8 @@ class Solution(eqx.Module, Generic[StateT]):
     - `margin`: how near it came to an event that did not happen: the least value of an indicator function (or of a
         multiplier's distance from its bound) that fell and rose again, over what an error of the state by the
         tolerance of a step makes of it. Up to some tens the itinerary is a matter of the tolerance. Infinite where
-        nothing came nearer than a tenth of its own size on a step; a surface of several components is not looked at.
-        NaN for steps of a given length.
+        nothing came nearer than a tenth of its own size on a step (of `Affine`: a ten-thousandth, on an arc); a surface
+        of several components is not looked at. NaN for steps of a given length.
 
     With `SaveAt(dense=True)`, `sol(t)` is the state at a time, or at each of an array of times; see `evaluate`.
     """

@@ -14,7 +14,7 @@ from jaxtyping import Array, Int
 
 from .._numerics._autodiff import dense_jacobian, forward_only, frozen
 from .._numerics._compile import interactive
-from .._numerics._first_pass import is_first_pass, left_over
+from .._numerics._first_pass import left_over
 from .._numerics._jaxpr import bends_and_jumps, jumps
 from .._numerics._linalg import WRITTEN_OUT
 from .._numerics._merge import merged
@@ -350,8 +350,8 @@ def solve(
         a repulsive surface that is reached is crossed, and a start on one is refused. `Solution.unique` tells.
     - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, Euler,
         `nsjax.Taylor`, or for models that are affine in the state `nsjax.Exponential` or, for sweeps, `nsjax.Affine`.
-        By default `diffrax.Tsit5()`, and within `nsjax.sweep` `nsjax.Affine()` for what that can do: where nothing is
-        said of steps either (by `stepsize_controller`, `dt0`, `SaveAt(steps=...)` or `SaveAt(dense=True)`).
+        By default `diffrax.Tsit5()`; within `nsjax.sweep` `nsjax.Affine()` for what that can do, where nothing is said
+        of steps (by `stepsize_controller`, `dt0`, `SaveAt(steps=...)` or `SaveAt(dense=True)`).
     - `stepsize_controller`: by default `diffrax.PIDController` with `rtol = atol = 1e-8` (1e-5 for float32).
     - `rtol`, `atol`: relative and absolute tolerance of that default controller, if not these; not to be given together
         with `stepsize_controller`.
@@ -374,13 +374,11 @@ def solve(
     t0, y0, given = checked_start(system, t0, y0, mode)
     t1 = checked_time("t1", t1, t0.dtype)
     check_span(system, t0, t1, saveat)
-    wanted = saveat.dense or Request.of(saveat).steps
-    own = solver is None and stepsize_controller is None and dt0 is None and not wanted
-    plain = is_first_pass() and (own or isinstance(solver, Affine)) and isinstance(adjoint, dfx.ForwardMode)
-    solver = dfx.Tsit5() if solver is None else solver
     integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint).checked(
         t0.dtype, rtol=rtol, atol=atol
     )
+    if dt0 is not None or saveat.dense or Request.of(saveat).steps:  # which are those of a solver
+        integrator = integrator._replace(open=False)
     if throw:
         check_numbers(system, t0, t1, y0)
     system = arrays_of(system, t0.dtype)
@@ -391,7 +389,7 @@ def solve(
         dt0 = jnp.abs(jnp.asarray(dt0, t0.dtype))
     concrete = throw and known((system, t0, t1, y0, given, integrator, saveat, dt0))
     within = throw and not concrete  # raised by the compiled program itself
-    options = _Options(given, integrator, saveat, dt0, within, progress_meter, plain=plain)
+    options = _Options(given, integrator, saveat, dt0, within, progress_meter, plain=integrator.may_be_plain)
     sol, left = _run(system, t0, t1, y0, options)
     if left is not None:
         return left_over(left, sol)
@@ -419,5 +417,7 @@ def integrate(
 ) -> Solution:
     """`solve` for arguments that have been checked, which never raises. `still`: only `y1` has derivatives, not what is
     saved or logged on the way, which makes a smaller program."""
-    options = _Options(given_modes(system, mode), integrator.with_arrays(t0.dtype), saveat, still=still)
-    return _run(arrays_of(system, t0.dtype), t0, jnp.asarray(t1, t0.dtype), y0, options)[0]
+    how = dict(still=still, plain=integrator.may_be_plain)
+    options = _Options(given_modes(system, mode), integrator.with_arrays(t0.dtype), saveat, **how)
+    sol, left = _run(arrays_of(system, t0.dtype), t0, jnp.asarray(t1, t0.dtype), y0, options)
+    return sol if left is None else left_over(left, sol)

@@ -28,6 +28,9 @@ from ._pursuit import Pursuit, Window
 from ._section import Section
 
 
+TWO_PROGRAMS = 2048  # solutions, from which on the exact flow gains more than it takes to compile
+
+
 @shown
 class AttractorChart(eqx.Module):
     """What solutions settle on, over two parameters.
@@ -116,7 +119,7 @@ def attractor_chart(
     max_time: Any = None,
     interval: Any = None,
     t0: Any = 0.0,
-    solver: dfx.AbstractSolver = dfx.Dopri8(),
+    solver: dfx.AbstractSolver | None = None,
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     rtol: float | None = None,
     atol: float | None = None,
@@ -155,7 +158,8 @@ def attractor_chart(
     - `section`, `direction`, `max_time`: as for `poincare_map`; by default an iterate is a period of the forcing.
     - `interval`: instead of these, for an autonomous system whose solutions come to rest: how often to look [time].
     - `t0`: the phase of the forcing [time].
-    - `solver`, `stepsize_controller`, `rtol`, `atol`: as for `solve`. `max_steps`, `max_events`: for each iterate.
+    - `solver`, `stepsize_controller`, `rtol`, `atol`: as for `solve`; by default Dopri8, and `Affine` for what that can
+        do, if there are 2,048 solutions or more. `max_steps`, `max_events`: for each iterate.
     - `chunk`, `devices`: how many solutions go together, and on which devices, see `sweep`.
     - `path`: a folder that keeps what is done, a chunk at a time, and from which a call that was interrupted goes on,
         with a larger `max_iterates` too. See `Sweep`.
@@ -178,15 +182,19 @@ def attractor_chart(
     if paths[0] == paths[1]:
         raise ValueError(f"Argument `parameters` must name two parameters, but {names[0]!r} and {names[1]!r} are one.")
     t0, start, _ = checked_start(system, t0, start, None)
-    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(t0.dtype, rtol=rtol, atol=atol)
+    integrator = Integrator(solver, stepsize_controller, max_steps, max_events).checked(
+        t0.dtype, rtol=rtol, atol=atol, default=dfx.Dopri8()
+    )
     system = arrays_of(system, t0.dtype)
     values = [np.asarray(parameters[name], t0.dtype) for name in names]
     for name, value in zip(names, values):
         if value.ndim != 1 or not len(value):
             text = f"Argument `parameters` must hold vectors, but the shape of `{name}` is {value.shape}."
             raise ValueError(text)
-    step = map_of(system, section, (direction, max_time), interval, (t0, start), integrator)
     shape = len(values[0]), len(values[1])
+    if shape[0] * shape[1] < TWO_PROGRAMS:
+        integrator = integrator._replace(open=False)
+    step = map_of(system, section, (direction, max_time), interval, (t0, start), integrator)
     if chunk is None:
         chunk = default_chunk(min(shape[0] * shape[1], 65536), devices_of(devices)[0].platform)
     positive("chunk", chunk)

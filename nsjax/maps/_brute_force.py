@@ -141,7 +141,7 @@ def brute_force(
     keep: int = 50,
     carry: bool = False,
     t0: Any = 0.0,
-    solver: dfx.AbstractSolver = dfx.Tsit5(),
+    solver: dfx.AbstractSolver | None = None,
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     rtol: float | None = None,
     atol: float | None = None,
@@ -175,7 +175,8 @@ def brute_force(
     - `carry`: whether each value begins where the solution for the one before it ended, in the order of `values`, which
         follows a branch to where it ends: with `values` rising and falling it shows hysteresis. `starts` are for the
         first. By default every value has all of them.
-    - `solver`, `stepsize_controller`, `rtol`, `atol`: as for `solve`. `max_steps`, `max_events`: for each point.
+    - `solver`, `stepsize_controller`, `rtol`, `atol`: as for `solve` within `sweep`; by default Tsit5, and `Affine` for
+        what that can do. `max_steps`, `max_events`: for each point.
     - `chunk`, `devices`: how many solutions go together, and on which devices, see `sweep`.
     - `path`: a folder that keeps what is done, a chunk of solutions at a time, and from which a call that was
         interrupted goes on; see `Sweep`.

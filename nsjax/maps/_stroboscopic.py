@@ -59,7 +59,7 @@ def stroboscopic_map(
     iterates: int | None = None,
     t0: Any = 0.0,
     mode: Any = None,
-    solver: dfx.AbstractSolver = dfx.Tsit5(),
+    solver: dfx.AbstractSolver | None = None,
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     rtol: float | None = None,
     atol: float | None = None,

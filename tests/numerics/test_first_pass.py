@@ -48,16 +48,34 @@ def test_nothing_to_tell():
     assert left is None and out[0] == jnp.sin(1.0)
 
 
-@pytest.mark.parametrize("loop", ["while", "scan", "cond"])
-def test_in_a_loop(loop):
-    """There nobody could tell."""
+def turned(x):
+    return jax.lax.scan(lambda x, k: (root(x) - k, x), x, jnp.asarray([0.0, 2.0, 3.0]))
+
+
+def branched(x):
+    return jax.lax.cond(x > 5, lambda x: x, root, x)
+
+
+@pytest.mark.parametrize(
+    "fn, want",
+    [(turned, [True, True, True]), (lambda x: turned(x + 15), [False, True, False]), (branched, [False, True, False])],
+    ids=["scan", "scan to its end", "cond"],
+)
+def test_in_loops_and_branches(fn, want):
+    with first_pass():
+        out, left = jax.jit(jax.vmap(told(fn)))(x)
+        one, alone = told(fn)(x[2])
+    np.testing.assert_array_equal(left, want)
+    assert alone == want[2]
+    jax.tree.map(np.testing.assert_array_equal, out, jax.vmap(fn)(x))
+    jax.tree.map(np.testing.assert_array_equal, one, fn(x[2]))
+
+
+def test_in_a_loop_without_a_bound():
+    """What is left over might keep it from ending."""
 
     def fn(x):
-        if loop == "while":
-            return jax.lax.while_loop(lambda x: x > 2, root, x)
-        if loop == "scan":
-            return jax.lax.scan(lambda x, _: (root(x), None), x, length=2)[0]
-        return jax.lax.cond(x > 0, root, lambda x: x, x)
+        return jax.lax.while_loop(lambda x: x > 2, root, x)
 
     with first_pass(), pytest.raises(UnreachableError):
         told(fn)(x[0])
