@@ -22,6 +22,9 @@ class Integrator(NamedTuple):
     adjoint: dfx.AbstractAdjoint = dfx.ForwardMode()
     open: bool = False  # whether nothing was said of solver and steps, so that another method may be taken
 
+    def __repr__(self) -> str:  # as it is kept in files
+        return f"Integrator({', '.join(f'{name}={value!r}' for name, value in self.arguments.items())})"
+
     @property
     def arguments(self) -> dict[str, Any]:
         """Those of `solve`."""
@@ -59,11 +62,8 @@ class Integrator(NamedTuple):
                 "matrix exponential is a loop of unknown length; use `diffrax.DirectAdjoint()`."
             )
         controller = _controller(self.stepsize_controller, dtype, tolerance, dict(rtol=rtol, atol=atol))
-        solver, nothing = (
-            _implicit(solver, controller, adjoint),
-            self.solver is None and self.stepsize_controller is None,
-        )
-        return self._replace(solver=solver, stepsize_controller=controller, open=nothing)
+        found = self._replace(solver=_implicit(solver, controller, adjoint), stepsize_controller=controller)
+        return found._replace(open=self.solver is None and self.stepsize_controller is None)
 
     @property
     def may_be_plain(self) -> bool:

@@ -81,10 +81,12 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     start, stop = t0 * direction, t1 * direction
     model = SwitchedSystem(system.assembled(), direction, start, y0).at(start)
     state, forked, result = start_mode(model, start, y0, options.given, frozen(stop - start))
-    solver = options.integrator.solver
-    exact = (options.plain or isinstance(solver, Affine)) and allows(model, options.meter, state, start, y0)
-    plain = options.plain and exact
-    options = options._replace(integrator=options.integrator._replace(solver=Affine() if plain else solver))
+    # (To end on a surface is not plain: none of a map's solutions would be.)
+    plain = options.plain and not any(switch.ends for switch in model.switches)
+    exact = (plain or isinstance(options.integrator.solver, Affine)) and allows(model, options.meter, state, start, y0)
+    plain = plain and exact
+    if plain:
+        options = options._replace(integrator=options.integrator._replace(solver=Affine()))
     stepper = _stepper(options.integrator).made_for(model, state, start, y0)
     y0 = model.project(start, y0, state)  # a change of y0 off the surface that holds it changes nothing
     flow = _flow(model, stepper, (start, stop), y0, state, options)

@@ -53,6 +53,9 @@ def sweep(
     y1 = nsjax.sweep(final, jnp.linspace(0.1, 1.0, 4096))  # y1.x has shape (4096,)
     ```
 
+    Called directly, it solves models that are affine between events by `nsjax.Affine` if no solver is named, and by the
+    general flow those lanes in which something is not plain: `fn` is traced a second time for them.
+
     Derivatives go through it (`jax.jacfwd`, and `jax.grad` if `fn` allows it), and it may stand within `jax.jit`.
     For sweeps that take hours there is `Sweep`, which keeps what it has done.
 

@@ -10,6 +10,7 @@ from models import flat, Motion
 
 import nsjax
 from nsjax import gallery, sweep
+from nsjax._numerics._first_pass import first_pass, told
 
 
 class Ball(nsjax.System):
@@ -59,6 +60,27 @@ def test_exact_where_it_is_plain(found):
     assert np.all(error[PLAIN] < 1e-13) and np.all(error < 1e-7)
     assert np.all(result == nsjax.RESULTS.successful)
     np.testing.assert_array_equal(np.asarray(steps == events + 1), PLAIN)
+
+
+def first(fn, *args):
+    """Whether a first pass may leave something over."""
+    with first_pass():
+        return jax.eval_shape(told(fn), *args)[1] is not None
+
+
+def test_where_there_is_a_first_pass():
+    """Of affine models, by the solver that is for them or where none is named; of no others."""
+    e, start = E[0], Motion(0.5, 0.0)
+    assert first(thrown, e)
+    assert first(lambda e: thrown(e, solver=nsjax.Affine()), e)
+    assert first(lambda e: thrown(e, rtol=1e-10), e)
+    assert first(lambda e: nsjax.stroboscopic_map(gallery.ForcedFriction(), start).y, e)
+    assert not first(lambda e: thrown(e, solver=dfx.Tsit5()), e)
+    assert not first(lambda e: thrown(e, stepsize_controller=dfx.ConstantStepSize(), dt0=0.1), e)
+    assert not first(lambda e: nsjax.solve(gallery.FallingStickSlip(), 0.0, 1.0, start).y1, e)
+    # The solutions of this map end on a surface, which is not plain.
+    way = dict(max_time=9.0, throw=False)
+    assert not first(lambda x: nsjax.poincare_map(gallery.StickSlip(), lambda t, y: y.v, Motion(x, 0.1), **way).y, e)
 
 
 @pytest.mark.slow
