@@ -27,7 +27,8 @@ matplotlib.use("Agg")
 gc.set_threshold(100_000, 20, 20)  # tracing makes many objects, and looking through them takes a fifth of its time
 
 
-MOST, MORE = 1.6e9, 6e8  # bytes of a process from which on it forgets between two tests of a file too, if it has grown
+MUCH = 9e8  # bytes of a process from which on it forgets between two files
+MOST, MORE = 1.6e9, 6e8  # and between two tests of a file too, if it has grown
 kept = [0]  # bytes that were left then, of which the system gets nothing back
 
 
@@ -49,9 +50,10 @@ def size():
 
 @pytest.fixture(autouse=True, scope="module")
 def forgotten():
-    """Programs of one file are of no use to the next."""
+    """Programs of one file are of little use to the next; but to drop them takes most of a second."""
     yield
-    forget()
+    if not 0 < size() < MUCH:
+        forget()
 
 
 @pytest.fixture(autouse=True)
