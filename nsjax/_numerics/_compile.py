@@ -107,17 +107,21 @@ def on_host(tree: Any) -> Any:
     return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree)
 
 
-def long_running(fn: F) -> F:
-    """`equinox.filter_jit` for what is called directly and runs for long: with all of XLA's optimisation, and where it
-    is not part of another program the options of sweeps."""
+def _ways(fn: Callable[..., Any], options: Callable[[], dict[str, Any]]) -> tuple[Any, Callable[[], Any], Programs]:
+    """`fn` as part of another program, as one by itself (to which alone options can be given), and as one kept."""
     jit: Any = eqx.filter_jit
-    within = jit(fn)
 
     @ft.cache  # not on import: which options there are is found out by compiling
     def alone() -> Any:
-        return jit(fn, compiler_options=swept())
+        return jit(fn, compiler_options=options())
 
-    kept = Programs(fn, swept)
+    return jit(fn), alone, Programs(fn, options)
+
+
+def long_running(fn: F) -> F:
+    """`equinox.filter_jit` for what is called directly and runs for long: with all of XLA's optimisation, and where it
+    is not part of another program the options of sweeps."""
+    within, alone, kept = _ways(fn, swept)
 
     @full_products
     @ft.wraps(fn)
@@ -132,19 +136,11 @@ def interactive(fn: F, host: bool = False) -> F:
     """`equinox.filter_jit` for what a user calls and waits for: compiled quickly, where it is not part of another
     program. With `host` it returns NumPy's arrays, as every operation that Python applies to one of JAX's is compiled
     as a program of its own."""
-    jit: Any = eqx.filter_jit
-    within = jit(fn)
-
-    @ft.cache  # not on import: which options there are is found out by compiling
-    def alone() -> Any:
-        return jit(fn, compiler_options=options())
-
-    kept = Programs(fn, options)
+    within, alone, kept = _ways(fn, options)
 
     @full_products
     @ft.wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
-        # The options can only be given to the outermost program.
         mine = outermost()
         run = kept if eager() and is_kept() else alone() if mine else within
         with without_collection(), whole_loops(mine):

@@ -102,9 +102,9 @@ class Affine(AbstractExponential):
     of several components or resets of their own, or in which one switch acts on the surface of another one (friction
     and a wall on one body), for which this is `Exponential`. Tolerances play no role.
 
-    Within `nsjax.sweep` it is the default. There what is plain is a program of its own, that is compiled in half of the
-    time of others; lanes that it leaves over are computed again with the general loop, by a second program, which is
-    compiled if there are any. Sweeps of small systems take a tenth to a fortieth of the time of `Exponential`. In a
+    Within `nsjax.sweep` it is the default. There what is plain is a program of its own, that is compiled sooner
+    than others; lanes that it leaves over are computed again with the general loop, by a second program, which is
+    compiled if there are any. Sweeps of small systems take a tenth to a twenty-fifth of the time of `Exponential`. In a
     `vmap`, or a sweep over a mesh, within `jax.jit` or a derivative, both are one program, which takes longest of all
     to compile; there it has to be named.
     """
