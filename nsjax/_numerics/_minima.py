@@ -16,20 +16,21 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
+from ._barrier import once
 
 
-NODES = 64  # parts of a piece
+NODES = 40  # parts of a piece: they resolve a phase of 7.6, somewhat more than a period
 # Chebyshev's points, denser at both ends, and the weights of integrals over them (Clenshaw and Curtis).
 THETA = 0.5 - 0.5 * np.cos(np.pi * np.arange(NODES + 1) / NODES)
 _moments = [0.0 if k % 2 else 1 / (1 - k**2) for k in range(NODES + 1)]
 WEIGHTS = np.linalg.solve(np.polynomial.chebyshev.chebvander(2 * THETA - 1, NODES).T, _moments)
 
-RESOLVED = 1e-9  # the part of its largest value by which a polynomial may miss a function
+RESOLVED = 1e-10  # the part of its largest value by which a polynomial may miss a function
 MARGIN = 8.0  # an unresolved function is lower than at its nodes by at most this many times what may be missed
 CALM = 1e-2  # of what may be missed: after a piece that misses less the next is twice as long
 SHORTEST = 2.0**-14  # of the path: a kink is not resolved by any polynomial
 BESIDE = 6e-4  # of the path: nearer to a zero a function divided by it is rounding divided by little
-REFINEMENTS = 4  # of Newton's method, each of which doubles the digits
+REFINEMENTS = 5  # of Newton's method, each of which doubles the digits
 NARROWINGS = 16  # of a dip in which parts meet, to a third each
 
 # θ = (1 - cos φ) / 2: in φ the polynomials are cosine series, and the nodes are equally spaced.
@@ -83,7 +84,7 @@ def minima(
 
     - `sample`: from two shares of the path and the state at the first, the times and states at the nodes between them,
         and quantities that add up over pieces.
-    - `functions`: from times and states at nodes the functions' values, in groups of shape `(nodes, functions, parts)`,
+    - `functions`: from times and states at nodes the functions' values, in groups of shape `(functions, parts, nodes)`,
         each the largest of its parts, which are smooth; and how much of each does not matter, shape `(functions,)`:
         what the errors of the states make of it.
     - `x`: the state at the beginning.
@@ -102,13 +103,13 @@ def minima(
 
     def step(walk: _Walk) -> _Walk:
         end = walk.begin + walk.width
-        ts, xs, sums = sample(walk.begin, end, walk.x)
-        groups, slack = functions(ts, xs)
-        whole = jnp.concatenate([jnp.max(values, axis=-1) for values in groups], axis=1)
+        ts, xs, sums = once(sample(walk.begin, end, walk.x))
+        groups, slack = once(functions(ts, xs))
+        whole = jnp.concatenate([jnp.max(values, axis=1) for values in groups])
         missed = jnp.concatenate([_missed(values) for values in groups])
-        low, most = jnp.min(whole, axis=0), jnp.maximum(walk.minima.most, jnp.max(whole, axis=0))
+        low, most = jnp.min(whole, axis=1), jnp.maximum(walk.minima.most, jnp.max(whole, axis=1))
         seen = jnp.minimum(walk.seen, low)
-        allowed = RESOLVED * jnp.max(jnp.abs(whole), axis=0) + slack
+        allowed = RESOLVED * jnp.max(jnp.abs(whole), axis=1) + slack
         # What stays higher than what is known need not be resolved: a guard that is sharp far from zero would halve
         # piece after piece. (Divided by its zeros it is another function, which this bound says nothing of.)
         undivided = (orders[0] == 0) & (orders[1] == 0)
@@ -117,11 +118,11 @@ def minima(
 
         first, found = 0, []
         for values in groups:
-            part = slice(first, first := first + values.shape[1])
-            lowest = jax.vmap(ft.partial(_lowest, walk.begin, walk.width), in_axes=(1, 1, 0))
+            part = slice(first, first := first + len(values))
+            lowest = jax.vmap(ft.partial(_lowest, walk.begin, walk.width), in_axes=(0, 1, 0))
             found.append(lowest(values, orders[:, part], below(most)[part]))
         least, phi = (jnp.concatenate(column) for column in zip(*found))
-        states = jax.vmap(lambda phi: _interpolated(xs, phi))(phi)
+        states = jax.vmap(lambda phi: _interpolated(xs.T, phi))(phi)
         share = walk.begin + walk.width * _theta(phi)
         old = walk.minima
         lower = ~rough & ((least < old.least) | jnp.isnan(least))  # what cannot be told is not told wrong
@@ -155,8 +156,7 @@ def grouped(rows: list[list[Array]]) -> list[Array]:
     """Functions `[function][part]` of times, in groups of as many parts."""
     groups = []
     for count in sorted({len(row) for row in rows}):
-        these = [jnp.stack(row, axis=1) for row in rows if len(row) == count]
-        groups.append(jnp.stack(these, axis=1))
+        groups.append(jnp.stack([jnp.stack(row) for row in rows if len(row) == count]))
     return groups
 
 
@@ -180,30 +180,44 @@ def divided(values: Array, share: Array, orders: Array) -> Array:
     return jnp.where(beside, jnp.inf, values / jnp.where(beside, 1, below))
 
 
-def _interpolated(values: Float[Array, "nodes *parts"], phi: Scalar) -> Float[Array, "*parts"]:
+def _interpolated(values: Float[Array, "parts nodes"], phi: Scalar) -> Float[Array, " parts"]:
     """The polynomials through the values at the nodes, by the barycentric formula."""
     off = jnp.cos(phi) - jnp.asarray(np.cos(_PHI), phi.dtype)
     weights = jnp.asarray(_BARYCENTRIC, phi.dtype) / jnp.where(off == 0, 1, off)
     weights = jnp.where(jnp.any(off == 0), (off == 0).astype(phi.dtype), weights)
-    return weights @ values / jnp.sum(weights)
+    return values @ weights / jnp.sum(weights)
 
 
-def _missed(values: Float[Array, "nodes functions parts"]) -> Float[Array, " functions"]:
+def _missed(values: Float[Array, "functions parts nodes"]) -> Float[Array, " functions"]:
     """The last coefficients, which tell what the polynomials of a function miss."""
-    return jnp.max(jnp.abs(jnp.tensordot(jnp.asarray(_TAIL, values.dtype), values, 1)), axis=(0, 2))
+    return jnp.max(jnp.abs(values @ jnp.asarray(_TAIL.T, values.dtype)), axis=(1, 2))
+
+
+def _least(x: Float[Array, " n"]) -> tuple[Scalar, Array]:
+    """The least number, and where it is first. (XLA's own search for the place is slow on CPUs.)"""
+    least, index = jnp.min(x), jnp.arange(len(x), dtype=jnp.int32)
+    return least, jnp.min(jnp.where(x == least, index, len(x) - 1))
+
+
+def _beside(d: Float[Array, "3"]) -> Scalar:
+    """How much lower than at an end it may be between there and the next node: a + b u² + c u⁴ through three nodes."""
+    first, second = d[1] - d[0], d[2] - d[0]
+    c = (second - 4 * first) / 12
+    b = jnp.minimum(first - c, 0)
+    return jnp.where(jnp.isfinite(second) & (c > 0), b**2 / jnp.where(c > 0, 2 * c, 1), 0)
 
 
 def _lowest(
-    begin: Scalar, width: Scalar, values: Float[Array, "nodes parts"], orders: Float[Array, "2"], below: Scalar
+    begin: Scalar, width: Scalar, values: Float[Array, "parts nodes"], orders: Float[Array, "2"], below: Scalar
 ) -> tuple[Scalar, Scalar]:
     """The least value of a function on a piece, and at which φ."""
-    several = values.shape[1] > 1
+    several = len(values) > 1
 
     def whole(parts: Array, phi: Array) -> Array:
         value = jnp.max(parts, axis=-1) if several else parts[..., 0]
         return divided(value, begin + width * _theta(phi), orders)
 
-    d = whole(values, jnp.asarray(_PHI, values.dtype))
+    d = whole(values.T, jnp.asarray(_PHI, values.dtype))
     edge = jnp.full((1,), jnp.inf, d.dtype)
     before, after = jnp.concatenate([edge, d[:-1]]), jnp.concatenate([d[1:], edge])
     dip = (d <= before) & (d <= after) & jnp.isfinite(d)
@@ -212,6 +226,7 @@ def _lowest(
     bend = jnp.where(inside, left + right, 1)
     # Twice as deep as the parabola's, for half waves of two nodes.
     depth = jnp.where(inside, (right - left) ** 2 / jnp.where(bend > 0, 4 * bend, 1) + 0.05 * bend, (left + right) / 2)
+    depth = depth.at[0].add(_beside(d[:3])).at[-1].add(_beside(d[:-4:-1]))
     bound = jnp.where(dip, d - depth, jnp.inf)
     bound = jnp.where(bound < below, bound, jnp.inf)
     rounding = 64 * jnp.finfo(d.dtype).eps * jnp.max(jnp.abs(jnp.where(jnp.isfinite(d), d, 0)))
@@ -220,9 +235,10 @@ def _lowest(
         """Where a dip is lowest, by polynomials for its parts."""
         near = jnp.abs(i + jnp.asarray(_LOCAL, i.dtype))  # (both ends are mirrors)
         here = i.astype(d.dtype)
-        local = jnp.asarray(_TO_POWERS, d.dtype) @ values[NODES - jnp.abs(NODES - near)]
+        local = jnp.asarray(_TO_POWERS, d.dtype) @ values.T[NODES - jnp.abs(NODES - near)]
         low = jnp.where(jnp.isfinite(before[i]), -1.0, 0.0).astype(d.dtype)
         high = jnp.where(jnp.isfinite(after[i]), 1.0, 0.0).astype(d.dtype)
+        at_end, inwards = (i == 0) | (i == NODES), jnp.where(i == 0, 1, -1)
 
         def at(u: Array) -> Array:
             parts = ft.reduce(lambda total, c: total * u[..., None] + c, local[::-1])
@@ -233,7 +249,12 @@ def _lowest(
 
         def refine(_: Any, u: Scalar) -> Scalar:
             rate, bend = jax.jvp(slope, (u,), (jnp.ones_like(u),))
-            return jnp.clip(u - jnp.where(bend > 0, rate / jnp.where(bend > 0, bend, 1), 0), low, high)
+            new = jnp.clip(u - jnp.where(bend > 0, rate / jnp.where(bend > 0, bend, 1), 0), low, high)
+            # About an end it is even in u, which hides a dip beside it: a function of u², with these derivatives.
+            safe = jnp.where(at_end, u, 1)
+            rate, bend = rate / (2 * safe), (bend - rate / safe) / (4 * safe**2)
+            square = jnp.clip(u**2 - jnp.where(bend > 0, rate / jnp.where(bend > 0, bend, 1), 0), 1e-8, 1)
+            return jnp.where(at_end, inwards * jnp.sqrt(square), new)
 
         def narrow(_: Any, window: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
             points = jnp.linspace(*window, 7, dtype=d.dtype)
@@ -243,7 +264,7 @@ def _lowest(
         if several:  # where two parts meet it has a kink
             u = 0.5 * sum(lax.fori_loop(0, NARROWINGS, narrow, (low, high)))
         else:
-            u = lax.fori_loop(0, REFINEMENTS, refine, jnp.zeros_like(low))
+            u = lax.fori_loop(0, REFINEMENTS, refine, jnp.where(at_end, 0.5 * inwards, 0).astype(d.dtype))
         return (here + u) * _SPACING
 
     def deepen(state: tuple) -> tuple:
@@ -253,12 +274,12 @@ def _lowest(
         lower = value < least
         # (Dips with the same bound, to the last digit, are those of a symmetry.)
         rest = jnp.where(bound > next_bound, bound, jnp.inf)
-        return jnp.where(lower, value, least), jnp.where(lower, phi, place), jnp.min(rest), jnp.argmin(rest)
+        return jnp.where(lower, value, least), jnp.where(lower, phi, place), *_least(rest)
 
     def deeper(state: tuple) -> Array:
         least, _, next_bound, _ = state
         return next_bound < least - rounding
 
-    i = jnp.argmin(d)
-    start = d[i], i.astype(d.dtype) * _SPACING, jnp.min(bound), jnp.argmin(bound)
+    least, i = _least(d)
+    start = least, i.astype(d.dtype) * _SPACING, *_least(bound)
     return lax.while_loop(deeper, deepen, start)[:2]

@@ -19,31 +19,45 @@ def along(*functions, orders=None, slack=0.0, span=1.0):
         return ts, ts[:, None], last - first
 
     def values(ts, xs):
-        rows = [jnp.stack([part(ts) for part in parts], axis=1) for parts in functions]
-        return [jnp.stack(rows, axis=1)], jnp.full(len(functions), slack)
+        rows = [jnp.stack([part(ts) for part in parts]) for parts in functions]
+        return [jnp.stack(rows)], jnp.full(len(functions), slack)
 
-    orders = np.zeros((2, len(functions))) if orders is None else np.asarray(orders, float)
-    return jax.jit(lambda: minima(sample, values, jnp.zeros(1), jnp.asarray(orders)))()
+    orders = jnp.zeros((2, len(functions))) if orders is None else orders
+    return jax.jit(lambda: minima(sample, values, jnp.zeros(1), orders))()
+
+
+def wave(t, peaks):
+    return jnp.cos(2 * np.pi * peaks * t) + 0.3 * jnp.cos(2 * np.pi * 0.97 * peaks * t + 1)
+
+
+@jax.jit
+def extremes(peaks):
+    return along([lambda t: wave(t, peaks)], [lambda t: -wave(t, peaks)])
 
 
 @pytest.mark.parametrize("peaks", [1, 7, 40, 300, 3000])
 def test_many_peaks(peaks):
     """The deepest of many dips, whose depths change slowly from one to the next."""
-
-    def wave(t):
-        return jnp.cos(2 * np.pi * peaks * t) + 0.3 * jnp.cos(2 * np.pi * 0.97 * peaks * t + 1)
-
     t = np.linspace(0, 1, 400 * peaks + 1)
-    t = t[np.argmin(np.asarray(wave(t)))]
-    slope = jax.grad(lambda t: wave(t))
+    t = t[np.argmin(np.asarray(wave(t, peaks)))]
+    slope, bend = jax.grad(wave), jax.grad(jax.grad(wave))
     for _ in range(20):
-        t = np.clip(t - slope(t) / jax.grad(slope)(t), 0, 1)
-    found = along([wave], [lambda t: -wave(t)])
-    np.testing.assert_allclose(found.least[0], wave(t), rtol=1e-9)
-    assert found.least[0] < float(wave(found.xs[:, 0]).min()) or peaks == 1
+        t = np.clip(t - slope(t, peaks) / bend(t, peaks), 0, 1)
+    found = extremes(float(peaks))
+    np.testing.assert_allclose(found.least[0], wave(t, peaks), rtol=1e-9)
+    assert found.least[0] < float(wave(found.xs[:, 0], peaks).min()) or peaks == 1
     np.testing.assert_allclose(found.x[:, 0], found.share, atol=1e-9)
-    np.testing.assert_allclose(wave(found.share[0]), found.least[0], atol=1e-9)
+    np.testing.assert_allclose(wave(found.share[0], peaks), found.least[0], atol=1e-9)
     np.testing.assert_allclose(found.sums, 1, rtol=1e-14)
+
+
+def test_dips_beside_the_ends():
+    """Between the last two nodes a dip is seen only by the polynomial, which is even about the end."""
+    offsets = np.concatenate([np.linspace(-0.02, 0.02, 401), np.linspace(-1e-4, 1e-4, 201)])
+    found = along(*([lambda t, a=a: -jnp.cos(2 * np.pi * (t - a))] for a in offsets), span=1.0)
+    np.testing.assert_allclose(found.least, -1, rtol=1e-13)
+    apart = np.asarray(found.share) - offsets
+    np.testing.assert_allclose(apart, np.round(apart), atol=1e-7)
 
 
 def test_dips_of_nearly_one_depth():
@@ -68,18 +82,21 @@ def test_kinks():
     np.testing.assert_allclose(found.share, [0.3, 0.7], atol=1e-6)
 
 
+def rest(t):
+    return 1 + t + 0.999 * jnp.sin(30 * t)
+
+
+@jax.jit
+def between_zeros(before, after):
+    guard = lambda t: t**before * (1 - t) ** after * rest(t)  # noqa: E731
+    return along([guard], orders=jnp.stack([before, after])[:, None])
+
+
 @pytest.mark.parametrize("before, after", [(1, 0), (1, 1), (2, 1), (0, 2), (3, 0)])
 def test_zeros_at_the_ends(before, after):
     """Divided by them, it is least inside; a dip that comes down to zero is seen with them."""
-
-    def rest(t):
-        return 1 + t + 0.999 * jnp.sin(30 * t)
-
-    def guard(t):
-        return t**before * (1 - t) ** after * rest(t)
-
     t = np.linspace(1e-3, 1 - 1e-3, 1_000_001)
-    found = along([guard], orders=[[before], [after]])
+    found = between_zeros(float(before), float(after))
     np.testing.assert_allclose(found.least[0], np.asarray(rest(t)).min(), rtol=1e-7, atol=1e-9)
 
 

@@ -125,8 +125,8 @@ class Flows(eqx.Module):
             near = xs + TRUSTED * jnp.asarray(signs, x.dtype) * (unit + ratio * jnp.abs(xs))
             rows = jax.vmap(functions)(jnp.concatenate([ts, ts]), jnp.concatenate([xs, near]))
             both = grouped(rows)
-            off = [jnp.max(jnp.abs(v[: len(ts)] - v[len(ts) :]), axis=(0, 2)) for v in both]
-            return [v[: len(ts)] for v in both], jnp.concatenate(off)
+            off = [jnp.max(jnp.abs(v[..., : len(ts)] - v[..., len(ts) :]), axis=(1, 2)) for v in both]
+            return [v[..., : len(ts)] for v in both], jnp.concatenate(off)
 
         places = places_of(jax.eval_shape(functions, a, x))
         orders = jnp.zeros((2, len(places)), x.dtype)

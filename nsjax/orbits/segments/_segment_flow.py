@@ -146,10 +146,9 @@ def _samples(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeState
     m, scale, good = flow.generator(a, b, x, state)
     n, step = len(x), expm(m / NODES)
     z = jnp.zeros((len(m), 1), x.dtype).at[n, 0].set(1)
-    while z.shape[1] < NODES:
-        z = jnp.concatenate([z, step @ z], axis=1)
+    while z.shape[1] <= NODES:
+        z = jnp.concatenate([z, step @ z[:, : NODES + 1 - z.shape[1]]], axis=1)
         step = step @ step
-    z = jnp.concatenate([z, step @ z[:, :1]], axis=1)
     first = m @ z / NODES
     second = m @ first / NODES
     third = m @ second / NODES
