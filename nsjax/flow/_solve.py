@@ -14,7 +14,7 @@ from jaxtyping import Array, Int
 
 from .._numerics._autodiff import dense_jacobian, forward_only, frozen
 from .._numerics._compile import interactive
-from .._numerics._first_pass import left_over
+from .._numerics._first_pass import is_first_pass, left_over
 from .._numerics._jaxpr import bends_and_jumps, jumps
 from .._numerics._linalg import WRITTEN_OUT
 from .._numerics._merge import merged
@@ -379,7 +379,8 @@ def solve(
     integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint).checked(
         t0.dtype, rtol=rtol, atol=atol
     )
-    if dt0 is not None or saveat.dense or Request.of(saveat).steps:  # which are those of a solver
+    # Steps and dense output are those of a solver. (And what is said by default is the same program as what is not.)
+    if dt0 is not None or saveat.dense or Request.of(saveat).steps or not is_first_pass():
         integrator = integrator._replace(open=False)
     if throw:
         check_numbers(system, t0, t1, y0)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from models import Motion
+from programs import compilations
 
 import nsjax
 from nsjax import gallery
@@ -21,19 +22,25 @@ def same(a, b):
 
 
 def test_tolerances_are_those_of_the_default_controller():
+    """And what is given is the program of what is not."""
+
     def steps(**how):
         return nsjax.solve(SYSTEM, 0.0, 3.0, START, max_steps=512, **how)
 
-    for given, (rtol, atol) in {
-        (("rtol", 1e-4), ("atol", 1e-5)): (1e-4, 1e-5),
-        (("rtol", 1e-4),): (1e-4, 1e-8),
-        (("atol", 1e-5),): (1e-8, 1e-5),
-        (): (1e-8, 1e-8),
-    }.items():
-        want = steps(stepsize_controller=dfx.PIDController(rtol=rtol, atol=atol))
-        have = steps(**dict(given))
-        same((have.y1, have.stats), (want.y1, want.stats))
-    assert steps(rtol=1e-4, atol=1e-4).stats["num_steps"] < steps().stats["num_steps"]
+    plain = steps()
+    with compilations() as compiled:
+        for given, (rtol, atol) in {
+            (("rtol", 1e-4), ("atol", 1e-5)): (1e-4, 1e-5),
+            (("rtol", 1e-4),): (1e-4, 1e-8),
+            (("atol", 1e-5),): (1e-8, 1e-5),
+            (("solver", dfx.Tsit5()),): (1e-8, 1e-8),
+        }.items():
+            want = steps(stepsize_controller=dfx.PIDController(rtol=rtol, atol=atol))
+            have = steps(**dict(given))
+            same((have.y1, have.stats), (want.y1, want.stats))
+        same((have.y1, have.stats), (plain.y1, plain.stats))
+        assert int(steps(rtol=1e-4, atol=1e-4).stats["num_steps"]) < int(plain.stats["num_steps"])
+        assert not compiled
 
 
 def test_a_tolerance_may_vary_within_a_program():
@@ -121,9 +128,9 @@ def test_integers_wherever_a_state_is_taken():
     same(
         nsjax.saltation_matrix(SYSTEM, 0, whole, *modes), nsjax.saltation_matrix(SYSTEM, 0.0, Motion(2.0, 0.0), *modes)
     )
-    plane = gallery.HopfPitchfork(mu=1.0)
-    found = nsjax.find_equilibrium(plane, gallery.Plane(2, 0))
-    same(found.y, nsjax.find_equilibrium(plane, gallery.Plane(2.0, 0.0)).y)
+    plane, one_step = gallery.HopfPitchfork(mu=1.0), dict(max_steps=1, throw=False)
+    found = nsjax.find_equilibrium(plane, gallery.Plane(2, 0), **one_step)
+    same(found.y, nsjax.find_equilibrium(plane, gallery.Plane(2.0, 0.0), **one_step).y)
     several = nsjax.find_equilibria(plane, gallery.Plane(np.array([2, -2]), np.array([0, 0])))
     assert len(several) >= 2
     same(
