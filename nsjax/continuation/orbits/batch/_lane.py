@@ -47,6 +47,7 @@ class Place(NamedTuple):
 class Lane(NamedTuple):
     at: Place
     far: Place  # the step in which zeros are being located
+    bend: Array  # by how much the tangent turned in the last step, over its length
     length: Scalar  # of the step
     doing: Int[Array, ""]
     wanted: Bool[Array, " tests"]  # zeros still to be located
@@ -115,10 +116,11 @@ def follow_lane(
     tests = lane_tests(len(itinerary.slot), len(curve.model.slots))
     ends = jnp.asarray([test != BRANCH and test.kind not in PASSED for test in tests])
     lane = Lane(
-        at=at, far=at, length=zero, doing=jnp.where(found, STARTING, NO_ORBIT).astype(jnp.int32),
-        wanted=jnp.zeros_like(ends), target=none, near=jnp.zeros(2, u.dtype), off=jnp.zeros(2, u.dtype), tries=none,
-        end=jnp.full_like(zero, jnp.inf), last=none, arc=zero, rows=rows, arcs=jnp.zeros(points, u.dtype),
-        kinds=jnp.full(points, -1, jnp.int32), count=none, work=none,
+        at=at, far=at, bend=jnp.zeros_like(u), length=zero,
+        doing=jnp.where(found, STARTING, NO_ORBIT).astype(jnp.int32), wanted=jnp.zeros_like(ends), target=none,
+        near=jnp.zeros(2, u.dtype), off=jnp.zeros(2, u.dtype), tries=none, end=jnp.full_like(zero, jnp.inf), last=none,
+        arc=zero, rows=rows, arcs=jnp.zeros(points, u.dtype), kinds=jnp.full(points, -1, jnp.int32), count=none,
+        work=none,
     )  # fmt: skip
 
     def going(lane: Lane) -> Array:
@@ -152,7 +154,7 @@ def _moved(
     at, locating, starting = lane.at, lane.doing == LOCATING, lane.doing == STARTING
     chord = (lane.far.u - at.u) / jnp.where(locating, lane.length, 1)
     s = jnp.where(locating, _between(lane), lane.length)
-    guess = at.u + s * jnp.where(locating, chord, at.tangent)
+    guess = at.u + s * jnp.where(locating, chord, at.tangent + s / 2 * lane.bend)
     look = corrected(curve, itinerary, Plane(at.u, at.tangent, s), guess, turns=False)
     turn = jnp.where(starting & (look.tangent[-1] * upwards < 0), -1, 1).astype(s.dtype)
     # The sign of a determinant of which the tangent is a row.
@@ -181,9 +183,13 @@ def _between(lane: Lane) -> Scalar:
     return jnp.where(inside, s, (a + b) / 2)
 
 
-def _length(lane: Lane, here: Place, max_step: Array) -> Scalar:
+def _on(lane: Lane, here: Place, max_step: Array, passes: Bool[Array, ""]) -> Lane:
+    """At the end of the step, if it `passes`, with the length of the next."""
     turn = turn_between(lane.at.tangent, here.tangent)
-    return next_length(lane.length, turn, here.tangent, here.u, max_step)
+    length = next_length(lane.length, turn, here.tangent, here.u, max_step)
+    bend = (here.tangent - lane.at.tangent) / jnp.where(passes, lane.length, 1)
+    new = lane._replace(at=here, bend=bend, length=length, arc=lane.arc + lane.length)
+    return jax.tree.map(lambda new, old: jnp.where(passes, new, old), new, lane)
 
 
 def _stepped(lane: Lane, here: Place, good: Array, ends: Array, max_step: Array) -> Lane:
@@ -194,13 +200,10 @@ def _stepped(lane: Lane, here: Place, good: Array, ends: Array, max_step: Array)
     passes = good & ~jnp.any(changed)
     shorter = lane.length / 2
     lost = ~good & (shorter < SHORTEST)
-    on = lane._replace(
-        at=jax.tree.map(lambda new, old: jnp.where(passes, new, old), here, lane.at),
+    on = _on(lane._replace(length=jnp.where(good, lane.length, shorter)), here, max_step, passes)._replace(
         far=here,
-        length=jnp.where(passes, _length(lane, here, max_step), jnp.where(good, lane.length, shorter)),
         doing=jnp.where(lost, LOST, jnp.where(good & ~passes, LOCATING, STEPPING)).astype(jnp.int32),
         wanted=changed & good,
-        arc=lane.arc + jnp.where(passes, lane.length, 0),
         end=jnp.full_like(lane.end, jnp.inf),
     )
     return _aimed(_written(on, here.row, on.arc, -1, passes))
@@ -239,14 +242,11 @@ def _located(lane: Lane, here: Place, good: Array, s: Scalar, ends: Array, max_s
     over = closed & ~jnp.any(wanted)
     ended = over & jnp.isfinite(end)
     passes = over & ~ended
-    after = done._replace(
-        at=jax.tree.map(lambda new, old: jnp.where(passes, new, old), lane.far, lane.at),
-        length=jnp.where(passes, _length(lane, lane.far, max_step), lane.length),
+    after = _on(done, lane.far, max_step, passes)._replace(
         doing=jnp.where(ended, ENDED, jnp.where(passes, STEPPING, LOCATING)).astype(jnp.int32),
         wanted=wanted,
         end=end,
         last=last,
-        arc=lane.arc + jnp.where(passes, lane.length, 0),
     )
     aimed = _aimed(after)
     after = jax.tree.map(lambda a, b: jnp.where(closed & ~over, a, b), aimed, after)
