@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import reference
 from jax import Array
-from models import flat, itinerary, Motion, Point, times, Toggle
+from models import CHEAP, flat, itinerary, Motion, Point, times, Toggle
 from programs import count
 from scipy.linalg import expm
 from scipy.optimize import brentq
@@ -55,10 +55,10 @@ def springs(n):
     return 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
 
 
-def run_chain(x, v, t1=20.0, b=1.0, order=slice(None)):
+def run_chain(x, v, t1=20.0, b=1.0, order=slice(None), K=None):
     """The solution with the blocks (and so their switches) in another order."""
     x, v = (np.broadcast_to(np.asarray(a, float), (len(x),))[order] for a in (x, v))
-    K = springs(len(x))[order][:, order]
+    K = (springs(len(x)) if K is None else K)[order][:, order]
     y0 = Blocks(jnp.asarray(x), jnp.asarray(v), jnp.asarray(0.0))
     return solve(Chain(K=jnp.asarray(K), b=b), 0.0, t1, y0, max_steps=8192), y0, K
 
@@ -130,12 +130,13 @@ STARTS = {
 @pytest.mark.parametrize("b", [1.0, 1.4])
 @pytest.mark.parametrize("start", STARTS)
 def test_two_blocks(start, b):
-    """Pitfalls 2, 6, 7, 13, 15: against matrix exponentials. Two alike stick and slip at the same instants."""
+    """Pitfalls 2, 6, 7, 13, 15: against matrix exponentials. Two alike stick and slip at the same instants. (A third
+    one rides on the belt, held by no spring, so that the program is that of three.)"""
     x, v = STARTS[start]
     v = np.broadcast_to(v, 2)
     events, end = chain_exactly(x, v, 20.0, b=b)
-    sol, *_ = run_chain(x, v, b=b)
-    np.testing.assert_allclose(np.concatenate([sol.y1.x, sol.y1.v]), end[:4], atol=1e-6)
+    sol, *_ = run_chain([*x, 0.0], [*v, 0.2], b=b, K=np.pad(springs(2), (0, 1)))
+    np.testing.assert_allclose(np.concatenate([sol.y1.x[:2], sol.y1.v[:2]]), end[:4], atol=1e-6)
     # Events of several blocks at one instant are one or more rows of the log.
     changes = [
         (float(e.t), i, e.mode_after[f"b{i}"]) for e in sol.events for i in (0, 1)
@@ -503,7 +504,7 @@ class Root(nsjax.System):
 
 def test_surface_that_is_not_a_number():
     """Pitfall 30: told, not looped on."""
-    sol = solve(Root(), 0.0, 5.0, Point(1.0), throw=False)
+    sol = solve(Root(), 0.0, 5.0, Point(1.0), throw=False, **CHEAP)
     assert sol.result in (RESULTS.nonfinite_field, RESULTS.dt_min_reached)
 
 

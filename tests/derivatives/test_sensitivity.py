@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from models import CHEAP, Circle, flat, impact, Motion, pid, Plane, Touch
 
+import nsjax
 from nsjax import gallery, RESULTS, sensitivity, solve
 
 
@@ -81,26 +82,54 @@ def test_reverse():
 # Solutions that are not unique.
 
 
+class Example(nsjax.System):
+    """x1' = a1 + b1 s, x2' = a2 + b2 s, s in Sgn(x2 - 1), and |s| <= bound for what stays on x2 = 1."""
+
+    a1: float = 0.0
+    b1: float = 0.0
+    a2: float = 0.0
+    b2: float = -1.0
+    bound: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Plane(self.a1 + self.b1 * s.surface, self.a2 + self.b2 * s.surface)
+
+    @nsjax.sgn
+    def surface(self, t, y):
+        return y.y - 1
+
+    @surface.breakaway
+    def surface(self):
+        return self.bound
+
+
+POINT, STICKING = Example(), Example(a2=2.0, b2=1.0, bound=3.0)  # (2.3), example 2.5
+ATTRACTION, REPULSION = Example(4.0, 2.0, 2.0, -4.0), Example(-4.0, -2.0, -2.0, 4.0)  # examples 2.2, 2.3
+
+
+ONE_STEP = dict(solver=dfx.Euler(), stepsize_controller=dfx.ConstantStepSize(), dt0=1000.0)  # exact for these
+
+
 @pytest.mark.parametrize(
-    "system, t1, y0, mode, unique",
+    "system, t1, height, mode, unique",
     [
-        (gallery.SlidingPoint(), 3.0, LINE(2.0), None, True),
-        (gallery.StickingPoint(), 2.0, LINE(-1.0), None, False),  # it crosses, but might stay at x = 0
-        (gallery.StickingPoint(), 2.0, LINE(0.0), 0, False),
-        (gallery.StickingPoint(), 2.0, LINE(0.0), 1, False),
-        (gallery.StickingPoint(), 2.0, LINE(1.0), None, True),
-        (gallery.RepulsionSliding(), 1.0, PLANE(0.0, 1.25), None, True),
-        (gallery.RepulsionSliding(), 1.0, PLANE(0.0, 1.0), 0, False),
-        (gallery.RepulsionSliding(), 1.0, PLANE(0.0, 1.0), -1, False),
-        (gallery.RepulsionSliding(), -1.0, PLANE(0.0, 1.25), None, False),  # backwards it enters repulsion sliding
-        (gallery.AttractionSliding(), 1.0, PLANE(0.0, 1.25), None, True),
-        (gallery.AttractionSliding(), -1.0, PLANE(0.0, 1.0), 0, False),
+        (POINT, 3.0, 2.0, None, True),
+        (STICKING, 2.0, -1.0, None, False),  # it crosses, but might stay on the surface
+        (STICKING, 2.0, 0.0, 0, False),
+        (STICKING, 2.0, 0.0, 1, False),
+        (STICKING, 2.0, 1.0, None, True),
+        (REPULSION, 1.0, 0.25, None, True),
+        (REPULSION, 1.0, 0.0, 0, False),
+        (REPULSION, 1.0, 0.0, -1, False),
+        (REPULSION, -1.0, 0.25, None, False),  # backwards it enters repulsion sliding
+        (ATTRACTION, 1.0, 0.25, None, True),
+        (ATTRACTION, -1.0, 0.0, 0, False),
     ],
 )
-def test_unique(system, t1, y0, mode, unique):
+def test_unique(system, t1, height, mode, unique):
     """Section 2.4, examples 2.2 to 2.5: `Solution.unique` tells that `solve` or the user has chosen among several."""
-    sol = solve(system, 0.0, t1, y0, mode=None if mode is None else {"surface": jnp.asarray(mode)})
-    assert sol.unique == unique
+    y0, mode = Plane(0.0, 1.0 + height), None if mode is None else {"surface": jnp.asarray(mode)}
+    assert solve(system, 0.0, t1, y0, mode=mode, **ONE_STEP).unique == unique
 
 
 def test_friction_law_c_as_an_inclusion():
@@ -125,9 +154,8 @@ def test_repulsion_sliding_does_not_drift():
     the solutions that stay are exact."""
 
     def end(x1):
-        sol = solve(
-            gallery.RepulsionSliding(), 0.0, 100.0, PLANE(x1, jnp.ones_like(x1)), mode={"surface": jnp.asarray(0)}
-        )
+        y0, held = PLANE(x1, jnp.ones_like(x1)), {"surface": jnp.asarray(0)}
+        sol = solve(gallery.RepulsionSliding(), 0.0, 100.0, y0, mode=held, **ONE_STEP | dict(dt0=1.0))
         return flat_jax(sol.y1), sol
 
     s = sensitivity(end, 0.5)

@@ -253,6 +253,24 @@ def test_spellings_of_a_jump():
         assert not any(jumps(fn, jnp.asarray(0.5)))
 
 
+class Jumpy(nsjax.System):
+    """A gate that moves by functions each of which has a weight: so all are one program."""
+
+    floor: float = 0.0
+    table: float = 0.0
+    state: float = 0.0
+    kink: float = 0.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - 0.3 * s.gate)
+
+    @nsjax.sgn
+    def gate(self, t, y):
+        jumps = self.floor * STAIRS["floor"](t) + self.table * STAIRS["table"](t)
+        jumps = jumps + self.state * jnp.where(y.v > 0.2, 1.0, -1.0)
+        return y.x - jumps - self.kink * jnp.abs(t % 0.5 - 0.25)
+
+
 UNDECLARED = [("table", "Tsit5"), ("state", "Exponential")]
 
 
@@ -266,33 +284,19 @@ UNDECLARED = [("table", "Tsit5"), ("state", "Exponential")]
 )
 def test_undeclared(at, solver):
     """A surface that jumps where nothing tells of it is found, whatever the solver; and one that jumps with the state."""
-
-    class Jumpy(nsjax.System):
-        def vector_field(self, t, y, s):
-            return Motion(y.v, -y.x - 0.3 * s.gate)
-
-        @nsjax.sgn
-        def gate(self, t, y):
-            return y.x - 0.2 * (jnp.where(y.v > 0.2, 1.0, -1.0) if at == "state" else STAIRS[at](t))
-
     with pytest.raises(nsjax.SolveError, match="`Jumpy.gate`|`gate`"):
-        nsjax.solve(Jumpy(), 0.0, 5.0, Motion(1.0, 0.0), solver=SOLVERS[solver])
+        nsjax.solve(Jumpy(**{at: 0.2}), 0.0, 5.0, Motion(1.0, 0.0), solver=SOLVERS[solver])
 
 
 def test_too_fast_a_clock():
     """Time has too few digits for its ticks, or there are too many to be counted: told, and not as something else."""
-    start = Motion(0.1, 0.2)
-    for t0, T, dtype, told in (
-        (1e3, 1.7, jnp.float64, False),
-        (3e9, 1.7, jnp.float64, True),
-        (5e3, 1.7, jnp.float32, True),
+    for t0, T, dtype, tol, told in (
+        (1e3, 1.7, jnp.float64, 1e-8, False),
+        (3e9, 1.7, jnp.float64, 1e-8, True),
+        (5e3, 1.7, jnp.float32, 1e-5, True),
     ):
-        t0, T, start = (
-            jnp.asarray(t0, dtype),
-            jnp.asarray(T, dtype),
-            Motion(jnp.asarray(0.1, dtype), jnp.asarray(0.2, dtype)),
-        )
-        sol = nsjax.solve(Square(T=T), t0, t0 + 2, start, throw=False)
+        t0, T, *start = (jnp.asarray(x, dtype) for x in (t0, T, 0.1, 0.2))
+        sol = nsjax.solve(Square(T=T), t0, t0 + 2, Motion(*start), stepsize_controller=pid(tol), throw=False)
         assert (sol.result == RESULTS.clock_too_fast) == told and (told or sol.result == RESULTS.successful)
 
 
@@ -316,9 +320,9 @@ def test_margin_at_a_tick():
         def gate(self, t, y):
             return y.x - t % 1.0
 
-    run = jax.jit(lambda x: nsjax.solve(Comparator(), 0.2, 1.6, Ramp(x, jnp.zeros(())), stepsize_controller=pid(1e-8)))
     for gap in (1e-10, 1e-5):
-        np.testing.assert_allclose(run(1 + gap).margin, gap / 2e-8, rtol=1e-3)
+        sol = nsjax.solve(Comparator(), 0.2, 1.6, Ramp(1 + gap, 0.0), solver=dfx.Heun(), stepsize_controller=pid(1e-8))
+        np.testing.assert_allclose(sol.margin, gap / 2e-8, rtol=1e-3)
 
 
 @pytest.mark.slow
@@ -410,16 +414,7 @@ def test_table_and_a_wall_that_opens():
 
 def test_kinks_are_no_jumps():
     """A surface that is a continuous function of a sawtooth needs no clock (but steps)."""
-
-    class Triangle(nsjax.System):
-        def vector_field(self, t, y, s):
-            return Motion(y.v, -y.x - 0.3 * s.gate)
-
-        @nsjax.sgn
-        def gate(self, t, y):
-            return y.x - jnp.abs(t % 0.5 - 0.25)
-
-    sol = nsjax.solve(Triangle(), 0.0, 2.0, Motion(1.0, 0.0), throw=False)
+    sol = nsjax.solve(Jumpy(kink=1.0), 0.0, 2.0, Motion(1.0, 0.0), solver=SOLVERS["Tsit5"], throw=False)
     assert sol.result == RESULTS.successful and len(sol.events) == 1
     event = sol.events[0]
     np.testing.assert_allclose(event.y_after.x, abs(float(event.t) % 0.5 - 0.25), atol=1e-9)
@@ -461,17 +456,23 @@ def test_ticks_while_sticking():
     np.testing.assert_allclose(sol.y1.x, x, atol=1e-9)
 
 
+class Forced(nsjax.System):
+    """By a staircase and by a triangle wave, each written as a function of time."""
+
+    jump: float
+    kink: float
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x + self.jump * jnp.floor(t / 0.7) + self.kink * jnp.abs(t % 0.7 - 0.35))
+
+
 @pytest.mark.parametrize("forcing", ["jump", "kink"])
 def test_field_that_jumps_unannounced(forcing):
     """Methods that look at their error find a jump of the field, and pay for it in steps and in hundreds of tolerances;
     `Exponential`, which does not, refuses it."""
-
-    class Forced(nsjax.System):
-        def vector_field(self, t, y, s):
-            return Motion(y.v, -y.x + (jnp.floor(t / 0.7) if forcing == "jump" else jnp.abs(t % 0.7 - 0.35)))
-
+    system = Forced(float(forcing == "jump"), float(forcing == "kink"))
     for solver, atol in ((dfx.Tsit5(), 1e-5), (nsjax.Taylor(), 1e-6)):
-        sol = nsjax.solve(Forced(), 0.0, 5.0, Motion(0.0, 0.0), solver=solver)
+        sol = nsjax.solve(system, 0.0, 5.0, Motion(0.0, 0.0), solver=solver)
         edges = np.append(np.arange(0, 5, 0.35), 5.0)
         y = np.zeros(2)
         for b, e in zip(edges, edges[1:]):  # x'' = -x + p + q (t - b)
@@ -480,7 +481,7 @@ def test_field_that_jumps_unannounced(forcing):
             c, s, h = np.cos(e - b), np.sin(e - b), e - b
             y = np.array([p + q * h + x * c + v * s, q - x * s + v * c])
         np.testing.assert_allclose(flat(sol.y1), y, atol=atol)
-    sol = nsjax.solve(Forced(), 0.0, 5.0, Motion(0.0, 0.0), solver=nsjax.Exponential(), throw=False)
+    sol = nsjax.solve(system, 0.0, 5.0, Motion(0.0, 0.0), solver=nsjax.Exponential(), throw=False)
     assert sol.result == RESULTS.mode_not_affine
 
 

@@ -1,5 +1,7 @@
 """Nothing for nothing: a model pays only for what it contains, read off its jaxpr."""
 
+import functools
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -78,9 +80,12 @@ class Idle(nsjax.System):
         return y.x
 
 
-def primitives(system, derivative=lambda fn: fn, **kwargs):
-    kwargs = dict(solver=dfx.Heun(), stepsize_controller=dfx.ConstantStepSize(), dt0=0.1, throw=False) | kwargs
-    flow = derivative(lambda y: solve(system, 0.0, 1.0, y, **kwargs).y1)
+CHEAP = dict(solver=dfx.Heun(), stepsize_controller=dfx.ConstantStepSize(), dt0=0.1, throw=False)
+
+
+@functools.cache
+def primitives(kind, derivative=lambda fn: fn, saveat=dfx.SaveAt(t1=True)):
+    flow = derivative(lambda y: solve(kind(), 0.0, 1.0, y, saveat=saveat, **CHEAP).y1)
     return count(jax.make_jaxpr(flow)(Motion(jnp.ones(()), jnp.ones(()))).jaxpr)
 
 
@@ -90,7 +95,7 @@ def total(counter):
 
 @pytest.fixture(scope="module")
 def free():
-    return primitives(Free())
+    return primitives(Free)
 
 
 EVENT_CODE = ("compact_cond", "cond", "lu", "sort", "argmax", "argmin", "top_k", "custom_linear_solve")
@@ -101,16 +106,16 @@ def test_without_switches_no_event_code(free):
     assert free["while"] == 1 and free["scan"] == free["rolled"]
     for name in EVENT_CODE:
         assert free[name] == 0, name
-    one = primitives(Crossing())
+    one = primitives(Crossing)
     assert one["compact_cond"] >= 1 and one["while"] > 1
-    print(total(free), total(one), total(primitives(Rubbing())))
+    print(total(free), total(one), total(primitives(Rubbing)))
     assert total(free) < total(one) / 3
 
 
 def test_each_declaration_adds_its_own(free):
     """No switch, `sgn`, `sgn` and `impact`: no linear system for one multiplier, and derivatives where asked for, which
     add less than the program itself. (`benchmarks/cost.py` has the seconds.)"""
-    programs = {system: (primitives(system()), primitives(system(), jax.jacfwd)) for system in (Free, Rubbing, Hitting)}
+    programs = {system: (primitives(system), primitives(system, jax.jacfwd)) for system in (Free, Rubbing, Hitting)}
     print({system.__name__: tuple(map(total, both)) for system, both in programs.items()})
     for plain, derived in programs.values():
         assert total(plain) < total(derived) < 2 * total(plain)
@@ -129,19 +134,19 @@ def test_no_multiplier_where_nothing_slides():
     assert slots(Free()) == []
     assert slots(Crossing()) == [(0, False)] == slots(Idle())
     assert slots(Rubbing()) == [(0, False), (0, True), (0, True)]
-    assert total(primitives(Crossing())) < 0.8 * total(primitives(Rubbing()))
+    assert total(primitives(Crossing)) < 0.8 * total(primitives(Rubbing))
 
 
 def test_affine_surfaces_are_not_interpolated():
     """Bernstein coefficients of an affine h are its values at the control points."""
-    affine, bent = primitives(Rubbing()), primitives(Bent())
+    affine, bent = primitives(Rubbing), primitives(Bent)
     print(total(affine), total(bent), affine["dot_general"], bent["dot_general"])
     assert total(affine) < total(bent) and affine["sin"] < bent["sin"]
 
 
 def test_dense_output_costs_only_where_asked_for(free):
-    assert total(primitives(Free(), saveat=dfx.SaveAt(dense=True))) > total(free)
-    assert total(primitives(Free(), saveat=dfx.SaveAt(t0=True, t1=True))) < 1.2 * total(free)
+    assert total(primitives(Free, saveat=dfx.SaveAt(dense=True))) > total(free)
+    assert total(primitives(Free, saveat=dfx.SaveAt(t0=True, t1=True))) < 1.2 * total(free)
 
 
 class Sliders(nsjax.System):
@@ -159,11 +164,10 @@ class Sliders(nsjax.System):
 
 def test_each_switch_adds_and_does_not_multiply():
     """Equations against the number of switches that can hold: from five to six no more than a quarter is added."""
-    heun = dict(solver=dfx.Heun(), stepsize_controller=dfx.ConstantStepSize(), dt0=0.1, throw=False)
 
     def equations(n):
         y = Motion(jnp.ones(n), jnp.ones(n))
-        flow = jax.make_jaxpr(lambda y: solve(Sliders(n), 0.0, 1.0, y, **heun).y1)(y)
+        flow = jax.make_jaxpr(lambda y: solve(Sliders(n), 0.0, 1.0, y, **CHEAP).y1)(y)
         return total(count(flow.jaxpr))
 
     counts = [equations(n) for n in (1, 2, 5, 6)]

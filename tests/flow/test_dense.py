@@ -94,9 +94,14 @@ def test_save_times(t1, ts, what):
     assert _traced(t1 * jnp.asarray([0.0, 1.0])[: len(ts)], t1) == RESULTS.successful
 
 
+class Drift(nsjax.System):
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x)
+
+
 @jax.jit
 def _traced(ts, t1):
-    return nsjax.solve(BELT, 0.0, t1, Motion(2.5, 0.0), saveat=dfx.SaveAt(ts=ts), throw=False).result
+    return nsjax.solve(Drift(), 0.0, t1, Motion(2.5, 0.0), saveat=dfx.SaveAt(ts=ts), throw=False).result
 
 
 class Ramp(nsjax.System):

@@ -58,7 +58,10 @@ def exact():
 
 @pytest.mark.parametrize(
     "solver, order",
-    [*(pytest.param(solver, 5, marks=pytest.mark.slow) for solver in (dfx.Tsit5(), dfx.Dopri5())), (dfx.Dopri8(), 8)],
+    [
+        (dfx.Tsit5(), 5),
+        *(pytest.param(s, n, marks=pytest.mark.slow) for s, n in ((dfx.Dopri5(), 5), (dfx.Dopri8(), 8))),
+    ],
 )
 def test_errors_fall_with_the_tolerance(solver, order, exact):
     """State, event times and their derivatives by state and parameters after thirty events: the error falls as the

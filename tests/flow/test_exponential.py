@@ -55,9 +55,10 @@ class Linear(nsjax.System):
 
 
 def linear(A, b=0, a=0, c=0, w=1.0):
-    """Its fields as arrays: the columns are those of the velocity."""
-    A = np.asarray(A, float)
-    return Linear(jnp.asarray(A), *[jnp.zeros(len(A)).at[-1].set(x) for x in (b, a, c)], jnp.asarray(w))
+    """Of three states, so that all are one program: what comes after those of A stands still. Forces act on A's last."""
+    n = len(A)
+    forces = [jnp.zeros(3).at[n - 1].set(x) for x in (b, a, c)]
+    return Linear(jnp.zeros((3, 3)).at[:n, :n].set(jnp.asarray(A)), *forces, jnp.asarray(w))
 
 
 @jax.jit
@@ -84,7 +85,7 @@ SOLUTIONS = {
 @pytest.mark.parametrize("name", SOLUTIONS)
 def test_against_closed_forms(name):
     system, exact = SOLUTIONS[name]
-    sol = run(system, 40.0, jnp.zeros(2))
+    sol = run(system, 40.0, jnp.zeros(3))
     t = np.linspace(0, 40, 401)
     size = abs(exact(t)).max()
     assert sol.result == RESULTS.successful
@@ -151,7 +152,8 @@ def test_stick_slip():
     """A sweep of the belt's velocity, through up to thirty events, against closed forms; and the derivative by it,
     against forty digits."""
     v = np.linspace(0.1, 0.9, 9)
-    y1, slope, steps = jax.jit(jax.vmap(lambda v: jax.jvp(stick_slip, (v,), (1.0,), has_aux=True)))(v)
+    changed = jax.jit(lambda v: jax.jvp(stick_slip, (v,), (1.0,), has_aux=True))
+    y1, slope, steps = map(np.stack, zip(*map(changed, v)))
     np.testing.assert_allclose(y1, reference.stick_slip_final(v, 100.0), atol=1e-12)
     assert np.all(steps < 160)
     for i in (0, 4, 7):

@@ -144,12 +144,12 @@ def test_sticking_forgets():
 def test_standard_errors():
     """Of an orbit of order four the rates cancel; of rates that follow one another the error is the long-range one."""
     orbit = np.tile([1.0, -2.0, 3.0, -2.5], 128)[:, None]
-    assert standard_errors(jnp.asarray(orbit))[0] < 1e-12
+    assert jax.jit(standard_errors)(orbit)[0] < 1e-12
     noise = np.random.default_rng(1).normal(size=(200, 4096))
     rates = np.zeros_like(noise)
     for n in range(1, noise.shape[1]):
         rates[:, n] = 0.8 * rates[:, n - 1] + noise[:, n]
-    found = standard_errors(jnp.asarray(rates.T))
+    found = jax.jit(standard_errors)(rates.T)
     exact = 1 / (1 - 0.8) / np.sqrt(noise.shape[1])  # of the mean of an autoregression
     assert np.std(np.mean(rates, axis=1)) == pytest.approx(exact, rel=0.15)
     assert 0.9 < np.mean(found) / exact < 1.5 and np.min(found) > 0.5 * exact

@@ -86,11 +86,11 @@ def test_multipliers(name):
     def lanes(mode):
         state = ModeState.of(tuple(mode), (None,) * m)
         s = model.values(jnp.asarray(0.0), y, state)
-        return jnp.stack(s), model.flow(jnp.asarray(0.0), y, state).x
+        _, matrix = model.linear(jnp.asarray(0.0), y, state, tuple(mode.astype(float)))
+        return jnp.stack(s), model.flow(jnp.asarray(0.0), y, state).x, matrix
 
-    _, matrix = model.linear(jnp.asarray(0.0), y, ModeState.of(modes[0], (None,) * m), tuple(modes[0].astype(float)))
-    np.testing.assert_allclose(matrix, -A, rtol=1e-14)
-    for mode, s, f in zip(modes, *lanes(jnp.asarray(modes))):
+    for mode, s, f, matrix in zip(modes, *lanes(jnp.asarray(modes))):
+        np.testing.assert_allclose(matrix, -A, rtol=1e-14)
         held, want = mode == 0, mode.astype(float)
         want[held] = np.linalg.solve(A[np.ix_(held, held)], (p - A @ mode)[held])
         np.testing.assert_allclose(s, want, rtol=1e-12, atol=1e-13)

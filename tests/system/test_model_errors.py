@@ -6,7 +6,7 @@ import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import Heat, Motion, Plane, Point, Thermostat
+from models import Heat, Motion, pid, Plane, Point, Thermostat
 
 import nsjax
 from nsjax import gallery, RESULTS, saltation_matrix, solve
@@ -311,11 +311,15 @@ def test_mode_on_the_other_side():
 
 def test_limits():
     """Pitfall 16: a bound on events or steps that is reached is told."""
-    run = dict(throw=False, **CHEAP)
-    sol = solve(STICK_SLIP, 0.0, 100.0, Motion(2.5, -0.5), max_events=3, **run)
+
+    def bounded(tol):
+        how = dict(solver=dfx.Heun(), stepsize_controller=pid(tol), max_events=3, max_steps=100, throw=False)
+        return solve(STICK_SLIP, 0.0, 100.0, Motion(2.5, -0.5), **how)
+
+    sol = bounded(1e-2)
     assert sol.result == RESULTS.max_events_reached and len(sol.events) == 3 and sol.t1 == sol.events.t[2]
-    sol = solve(STICK_SLIP, 0.0, 100.0, Motion(2.5, -0.5), max_steps=20, **run)
-    assert sol.result == RESULTS.max_steps_reached and sol.stats["num_steps"] == 20 and sol.t1 < 100
+    sol = bounded(1e-4)
+    assert sol.result == RESULTS.max_steps_reached and sol.stats["num_steps"] == 100 and sol.t1 < 100
 
 
 def test_unknown_switch_by_item():

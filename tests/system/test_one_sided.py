@@ -1,5 +1,7 @@
 """Friction that is written with |v_rel|: in a mode the field is smooth on both sides of its surface."""
 
+import functools
+
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -129,26 +131,26 @@ def test_told_by_the_operations(system, way):
     assert seen == [want]
 
 
+@functools.partial(jax.jit, static_argnums=0)  # one program a law, for all modes and places
+def field_of(kind, mode, z):
+    """Of (x, v, v_dr, delta), with its derivatives."""
+
+    def of(z):
+        state = ModeState.of([mode], [None])
+        f = model_of(kind(v_dr=z[2], delta=z[3])).flow(jnp.zeros(()), Motion(z[0], z[1]), state)
+        return (jnp.stack([f.x, f.v]),) * 2
+
+    return jax.jacfwd(of, has_aux=True)(z)
+
+
 @pytest.mark.parametrize("system", SMOOTH, ids=lambda x: type(x).__name__)
 @pytest.mark.parametrize("mode", [-1, 0, 1])
 def test_flow_of_a_mode_is_smooth_beyond_its_surface(system, mode):
     """On both sides and on the surface, with derivatives by state and parameters, as of the laws one by one."""
-    state = ModeState.of([jnp.asarray(mode, jnp.int32)], [None])
-
-    def flow(system, x, v):
-        f = model_of(system).flow(jnp.zeros(()), Motion(x, v), state)
-        return jnp.stack([f.x, f.v])
-
+    mode = jnp.asarray(mode, jnp.int32)
     for v in [0.2] if mode == 0 else [0.2, 0.25, 0.15, 0.2 + 1e-17]:  # what holds is on the surface
-
-        def numbers(kind, v=v):
-            def of(z):
-                return flow(kind(v_dr=z[2], delta=z[3]), z[0], z[1])
-
-            z = jnp.asarray([0.4, v, 0.2, 3.0])
-            return of(z), jax.jacfwd(of)(z)
-
-        for got, want in zip(numbers(type(system)), numbers(Written)):
+        z = jnp.asarray([0.4, v, 0.2, 3.0])
+        for got, want in zip(field_of(type(system), mode, z), field_of(Written, mode, z)):
             np.testing.assert_allclose(got, want, atol=1e-14)
 
 
@@ -180,25 +182,30 @@ class BlocksWritten(Blocks):
         return jnp.stack([h[0] * s.first, h[1] * s.second, jnp.abs(v[2] - self.v_dr)])
 
 
+BLOCKS = Motion(jnp.array([0.4, -0.3, 0.1]), jnp.array([0.2, 0.2, 0.25]))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def field_of_blocks(kind, mode, z):
+    """Of (v_dr, delta, *v), with its derivatives."""
+
+    def of(z):
+        zero, state = jnp.zeros(()), ModeState.of(mode, [None, None])
+        model = SwitchedSystem.forwards(kind(v_dr=z[0], delta=z[1]), zero, BLOCKS, True)
+        f = model.flow(zero, Motion(BLOCKS.x, z[2:]), state)
+        return (jnp.concatenate([f.x, f.v]),) * 2
+
+    return jax.jacfwd(of, has_aux=True)(z)
+
+
 @pytest.mark.parametrize("mode", [(1, 1), (1, -1), (-1, 1)])
 def test_kinks_that_are_entries_of_an_array(mode):
-    y = Motion(jnp.array([0.4, -0.3, 0.1]), jnp.array([0.2, 0.2, 0.25]))
-    zero = jnp.zeros(())
-    sides = [SwitchedSystem.forwards(kind(), zero, y, True).sides for kind in (Blocks, BlocksWritten)]
+    sides = [SwitchedSystem.forwards(kind(), jnp.zeros(()), BLOCKS, True).sides for kind in (Blocks, BlocksWritten)]
     assert sides[1] is None and [(side.at, side.switch) for side in sides[0].kinks] == [(1, 1), (2, 0)]
-    state = ModeState.of(jnp.asarray(mode, jnp.int32), [None, None])
+    mode = jnp.asarray(mode, jnp.int32)
     for v in ([0.2, 0.2, 0.3], [0.25, 0.1, 0.1], [0.1, 0.25, 0.2 + 1e-17]):
-
-        def numbers(kind, v=v):
-            def of(z):
-                system = kind(v_dr=z[0], delta=z[1])
-                f = SwitchedSystem.forwards(system, zero, y, True).flow(zero, Motion(y.x, z[2:]), state)
-                return jnp.concatenate([f.x, f.v])
-
-            z = jnp.asarray([0.2, 3.0, *v])
-            return of(z), jax.jacfwd(of)(z)
-
-        for got, want in zip(numbers(Blocks), numbers(BlocksWritten)):
+        z = jnp.asarray([0.2, 3.0, *v])
+        for got, want in zip(field_of_blocks(Blocks, mode, z), field_of_blocks(BlocksWritten, mode, z)):
             np.testing.assert_allclose(got, want, atol=1e-14)
 
 
