@@ -19,6 +19,7 @@ from models import (
     pid,
     Plane,
     Puck,
+    Slider,
     Thermostat,
     times,
 )
@@ -36,20 +37,6 @@ def deviation(sol, ref, names):
     at_events = flat(sol.events.y_after)[: len(table)] - table[:, 2:].astype(float)
     time = np.abs(times(sol) - table[:, 0].astype(float)).max(initial=0)
     return time, np.abs([*at_events.ravel(), *(flat(sol.y1) - ref.y)]).max()
-
-
-class Slider(gallery.StickSlip):
-    """With the indicator function multiplied by `scale`."""
-
-    scale: float = 1.0
-
-    @nsjax.sgn
-    def belt(self, t, y):
-        return self.scale * (y.v - self.v_dr)
-
-    @belt.breakaway
-    def belt(self):
-        return self.F_stick / self.F_slip
 
 
 def slide(t1, x, v, **parameters):

@@ -137,16 +137,10 @@ class Circle(nsjax.System):
         return y.x**2 + y.y**2 - 1
 
 
-class Belt(nsjax.System):
-    """`gallery.StickSlip` with m = k = 1, c = 0 and the indicator function multiplied by `scale`."""
+class Slider(gallery.StickSlip):
+    """With the indicator function multiplied by `scale`."""
 
-    v_dr: float = 0.2
-    F_slip: float = 1.0
-    F_stick: float = 2.0
     scale: float = 1.0
-
-    def vector_field(self, t, y, s):
-        return Motion(y.v, -y.x - self.F_slip * s.belt)
 
     @nsjax.sgn
     def belt(self, t, y):
