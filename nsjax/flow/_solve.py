@@ -379,7 +379,7 @@ def solve(
     integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint).checked(
         t0.dtype, rtol=rtol, atol=atol
     )
-    # Steps and dense output are those of a solver. (And what is said by default is the same program as what is not.)
+    # Steps and dense output are those of a solver; and only a first pass asks, so that elsewhere it is one program.
     if dt0 is not None or saveat.dense or Request.of(saveat).steps or not is_first_pass():
         integrator = integrator._replace(open=False)
     if throw:
