@@ -10,6 +10,7 @@ from models import Duffing, Motion, pid
 
 import nsjax
 from nsjax import continue_orbit, continue_orbits, find_orbit, gallery, sweep
+from nsjax.continuation.orbits.batch._lane import _ahead, _on, Lane, Place
 
 
 HOW = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-12), max_events=4, method="shooting", throw=False)
@@ -59,6 +60,20 @@ def duffing():
     forces = jnp.array([0.2, 0.3, 0.4])
     orbits = sweep(lambda force: find_orbit(Duffing(c=0.1, F=force), Motion(0.3, 0.0), order=1, **HOW), forces)
     return orbits, continue_orbits(orbits, "omega", (0.9, 2.2), points=500)
+
+
+def test_steps_are_predicted_to_second_order():
+    """Round a circle: half the step, an eighth of what is missed."""
+
+    def place(s):
+        return Place(jnp.array([np.cos(s), np.sin(s)]), jnp.array([-np.sin(s), np.cos(s)]), None, None, None)
+
+    missed, blank = [], Lane(**dict.fromkeys(Lane._fields))
+    for h in (0.1, 0.05):
+        before = blank._replace(at=place(-h), bend=jnp.zeros(2), length=jnp.asarray(h), arc=0.0)
+        lane = _on(before, place(0.0), jnp.asarray(1.0), jnp.asarray(True))
+        missed.append(np.linalg.norm(_ahead(lane, h) - place(h).u))
+    np.testing.assert_allclose(missed[0] / missed[1], 8, rtol=0.05)
 
 
 @pytest.mark.slow

@@ -154,7 +154,7 @@ def _moved(
     at, locating, starting = lane.at, lane.doing == LOCATING, lane.doing == STARTING
     chord = (lane.far.u - at.u) / jnp.where(locating, lane.length, 1)
     s = jnp.where(locating, _between(lane), lane.length)
-    guess = at.u + s * jnp.where(locating, chord, at.tangent + s / 2 * lane.bend)
+    guess = jnp.where(locating, at.u + s * chord, _ahead(lane, s))
     look = corrected(curve, itinerary, Plane(at.u, at.tangent, s), guess, turns=False)
     turn = jnp.where(starting & (look.tangent[-1] * upwards < 0), -1, 1).astype(s.dtype)
     # The sign of a determinant of which the tangent is a row.
@@ -181,6 +181,11 @@ def _between(lane: Lane) -> Scalar:
     s = (a * fb - b * fa) / jnp.where(fb == fa, 1, fb - fa)
     inside = (s > a) & (s < b) & (lane.tries < TRIES // 2)
     return jnp.where(inside, s, (a + b) / 2)
+
+
+def _ahead(lane: Lane, s: Scalar) -> Array:
+    """The predictor, to second order."""
+    return lane.at.u + s * (lane.at.tangent + s / 2 * lane.bend)
 
 
 def _on(lane: Lane, here: Place, max_step: Array, passes: Bool[Array, ""]) -> Lane:
