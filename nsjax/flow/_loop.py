@@ -27,6 +27,7 @@ from ._save import Log, Saved
 from .events._attraction import escapes
 from .events._locate import Interval
 from .events._transition import Transition, transition
+from .steppers._sensitivity import largest_so_far, Sensed, trusted
 from .steppers._stepper import stack, Step, Stepper, unresolved, Watch
 
 
@@ -47,6 +48,7 @@ class Carry(eqx.Module):
     halted: Int[Array, ""]  # events in a row without progress in time
     halvings: Int[Array, ""]  # in a row, to resolve a guard
     crawled: Int[Array, ""]  # steps in a row of a few units in the last place of time
+    swing: Scalar  # whose derivative is the largest of the state's so far
     grazed: Bool[Array, ""]  # whether an event was tangential
     forked: Bool[Array, ""]  # whether another solution sets out from the start too, or branches off on the way
     margin: Scalar  # the nearest that a guard came to zero without meeting it
@@ -86,6 +88,11 @@ class Flow(eqx.Module):
     jumpy: tuple[bool, ...] = eqx.field(static=True)  # whether each guard holds an operation that may jump
     reverse: bool = eqx.field(static=True)  # whether the loop is to be transposed
     seen: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # of many guards what they take notice of, or empty
+
+    @property
+    def bounded(self) -> bool:
+        """Whether there are tolerances."""
+        return hasattr(self.controller, "rtol") and hasattr(self.controller, "atol")
 
     @property
     def tolerance(self) -> tuple[Any, Any]:
@@ -181,21 +188,28 @@ class Flow(eqx.Module):
     def pace(self, c: Carry, step: Step) -> tuple[Any, Any, PyTree, Any]:
         """Whether a step is accurate enough, the length of the next, and the controller's state and verdict."""
         model, t, t_next = self.model.within(c.state.mode), *frozen((c.t, step.t_next))
-        own = self.stepper.pace(self.controller, frozen(step), t, frozen(c.y), self.t1 - self.t0)
-        if own is not None:
-            return *own, c.controller, dfx.RESULTS.successful
-        # An error that is NaN counts as too large.
-        error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), step.error)
         terms = dfx.ODETerm(lambda t, y, args: model.flow(t, y, c.state))
-        # The step size is no function to be differentiated; powers of an error of zero are not even differentiable.
-        y, y1, error = frozen((c.y, step.y1, error))
-        # A step that overflows is too long, but must not make the next one infinity divided by infinity.
-        y1 = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), y1, y)
         order = self.stepper.solver.error_order(terms)
-        keep, a, b, _, controller, outcome = self.controller.adapt_step_size(
-            t, t_next, y, y1, None, error, order, c.controller
-        )
-        return keep, b - a, controller, outcome
+        own = self.stepper.pace(self.controller, frozen(step), t, frozen(c.y), self.t1 - self.t0)
+        if own is None:
+            # An error that is NaN counts as too large.
+            error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), step.error)
+            # The step size is no function to be differentiated; powers of an error of zero are not even differentiable.
+            y, y1, error = frozen((c.y, step.y1, error))
+            # A step that overflows is too long, but must not make the next one infinity divided by infinity.
+            y1 = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), y1, y)
+            keep, a, b, _, controller, outcome = self.controller.adapt_step_size(
+                t, t_next, y, y1, None, error, order, c.controller
+            )
+            dt = b - a
+        else:
+            (keep, dt), controller, outcome = own, c.controller, dfx.RESULTS.successful
+        estimate = self.stepper.estimate(step)
+        if estimate is not None and self.bounded and not self.reverse:
+            seen = Sensed(model, c.state, c.t, t_next - t, c.y, step.y1, estimate, c.swing, keep)
+            far = trusted(seen, self.tolerance, order)
+            keep, dt = keep & (far >= t_next - t), jnp.minimum(dt, 0.9 * far)
+        return keep, dt, controller, outcome
 
     def leaps(self, model: SwitchedSystem, c: Carry, step: Step) -> Bool[Array, ""]:
         """Whether a guard that no step is short enough to resolve jumps: changes by far more than its derivatives at
@@ -309,6 +323,7 @@ class Flow(eqx.Module):
             halted=halted,
             halvings=step.halvings,
             crawled=crawled,
+            swing=largest_so_far(c.swing, y),
             grazed=grazed,
             forked=forked,
             margin=jnp.minimum(c.margin, jnp.where(c.active, there.margin, jnp.inf)),

@@ -184,6 +184,7 @@ def _first_turn(flow: Flow, y: Y, state: ModeState, forked: Any, result: RESULTS
         halted=zero,
         halvings=zero,
         crawled=zero,
+        swing=jnp.zeros_like(t),
         grazed=jnp.zeros((), bool),
         forked=forked,
         margin=jnp.full_like(t, jnp.inf),

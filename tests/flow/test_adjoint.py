@@ -67,7 +67,7 @@ def learned(p, adjoint):
     """Through slip, stick and slip again: the state at the end and the times of the events."""
     law, x, v_dr, ratio = p
     system = Learned(eqx.combine(law, REST), v_dr, ratio)
-    sol = solve(system, 0.0, 10.0, Motion(x, 0.0), adjoint=adjoint, **models.CHEAP, max_steps=256, max_events=16)
+    sol = solve(system, 0.0, 10.0, Motion(x, 0.0), adjoint=adjoint, **models.CHEAP, max_steps=512, max_events=16)
     return sol.y1.x, sol.y1.v, sol.events.t[:2]
 
 

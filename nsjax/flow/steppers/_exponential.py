@@ -320,6 +320,9 @@ class ExponentialStepper(Stepper):
     def points(self, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
         return _control_points(ks)
 
+    def estimate(self, step: Step) -> None:
+        return None
+
     def pace(self, controller: Any, step: Step, t: Scalar, y: Y, length: Scalar) -> Any:
         excess: Any = step.error
         keep = excess <= 1

@@ -151,6 +151,10 @@ class Stepper(eqx.Module):
         others leave it to the controller."""
         return None
 
+    def estimate(self, step: Step) -> Y | None:
+        """That of a step of which derivatives tell how far they are wrong; None for a method whose are exact."""
+        return step.error
+
 
 def _written_out(tableau: dfx.ButcherTableau, f: Field, span: tuple[Scalar, Scalar], y: Y, k: Y) -> tuple[list[Y], Y]:
     """The increments of all stages, of which `k` is the first, and the state of the last stage."""

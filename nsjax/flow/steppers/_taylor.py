@@ -267,6 +267,9 @@ class TaylorStepper(Stepper):
         most = getattr(controller, "dtmax", None)
         return keep, jnp.where(keep, length if most is None else most, 0.5 * (step.t_next - t))
 
+    def estimate(self, step: Step) -> Y:
+        return step.ks[-1]  # not its error, of which the absolute value has no derivative where it is zero
+
     def least(self, c: list[Scalar], roots: Int[Array, ""]) -> Scalar:
         # Bernstein coefficients of the first terms; all that follow are at least minus their sum times u^n, which is
         # the last basis polynomial.

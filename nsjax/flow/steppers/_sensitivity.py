@@ -1,0 +1,126 @@
+"""The error of derivatives in the choice of steps: forward sensitivities are kept to a tolerance of their own.
+
+Where the state stands still its error says nothing, and steps that it alone had chosen would grow without bound; the
+derivatives at an equilibrium move all the same. Without differentiation none of this is in the program.
+"""
+
+import functools as ft
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool
+
+from ..._numerics._autodiff import frozen
+from ..._numerics._barrier import once, stored
+from ..._numerics._lane_cond import compact_cond
+from ..._types import Scalar, Y
+from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
+
+
+NEVER_BELOW = 0.01  # the phase that a step may always have, whatever the error of derivatives seems to be
+SLACK = 100  # derivatives may err by this many tolerances a step, so that they seldom are what makes it shorter
+
+
+@custom_vmap
+def _of_all_directions(worst: Scalar, state: Scalar) -> Scalar:
+    """The largest of `worst` among the directions of a derivative, which have their `state` in common."""
+    return worst
+
+
+@_of_all_directions.def_vmap
+def _of_a_batch(size: int, batched: list[bool], worst: Array, state: Array) -> tuple[Array, bool]:
+    if batched[1]:  # lanes, each with its own state
+        worst = worst if batched[0] else jnp.broadcast_to(worst, (size, *worst.shape))
+        return _of_all_directions(worst, state), True
+    # (XLA's code for a maximum along an axis takes as long as all stages of a step.)
+    most = ft.reduce(jnp.maximum, list(worst)) if size <= 16 else jnp.max(worst, axis=0)
+    return _of_all_directions(most, state), False
+
+
+@jax.custom_jvp
+def largest_so_far(swing: Scalar, y: Y) -> Scalar:
+    """A number that means nothing; its derivative is the largest that any number of the state has had so far."""
+    return swing
+
+
+@largest_so_far.defjvp
+def _largest_so_far_jvp(primals: tuple[Scalar, Y], tangents: tuple[Scalar, Y]) -> tuple[Scalar, Scalar]:
+    largest, dy = frozen(tangents)
+    for x in jax.tree.leaves(dy):
+        largest = jnp.maximum(largest, jnp.max(jnp.where(jnp.isfinite(x), jnp.abs(x), 0)))
+    return largest_so_far(*primals), largest
+
+
+class Sensed(NamedTuple):
+    """A step as its derivatives see it."""
+
+    model: SwitchedSystem
+    state: ModeState
+    t: Scalar
+    length: Scalar
+    y: Y
+    y1: Y
+    estimate: Y  # its derivative is the error of the derivatives
+    swing: Scalar  # `largest_so_far`
+    kept: Bool[Array, ""]  # whether it is accurate enough for the state; else that alone says how long the next is
+
+
+@eqx.filter_custom_jvp
+def trusted(step: Sensed, tolerance: tuple[Any, Any], order: int) -> Scalar:
+    """Up to which length a step may go. Without differentiation any; with it, as far as the error of derivatives, which
+    grows with that power of the length, stays below their tolerance.
+
+    That is a part of the derivative's size, and its absolute part one of the largest size so far: the same for any unit
+    of the parameter, and without care for what has been forgotten.
+    """
+    return jnp.full_like(step.length, jnp.inf)
+
+
+@trusted.def_jvp
+def _trusted_jvp(primals: Any, tangents: Any) -> tuple[Scalar, Scalar]:
+    step, (rtol, atol), order = frozen(primals)
+
+    def derivative(part: Callable[[Any], Any]) -> Y:
+        return jax.tree.map(lambda x, d: jnp.zeros_like(x) if d is None else d, part(step), part(frozen(tangents[0])))
+
+    errors, largest = derivative(lambda s: s.estimate), derivative(lambda s: s.swing)
+    dys = [derivative(lambda s: s.y), derivative(lambda s: s.y1)]
+    sizes = jax.tree.map(lambda *dys: ft.reduce(jnp.maximum, map(jnp.abs, dys)), *dys)
+    largest = ft.reduce(jnp.maximum, map(jnp.max, jax.tree.leaves(sizes)), largest)
+    # (A derivative of zero has no error, and one that does not exist must not end the solution.)
+    floor = atol * largest + jnp.finfo(step.t.dtype).tiny
+    ratios = jax.tree.map(lambda e, size: jnp.max(jnp.abs(e) / (floor + rtol * size)), stored(errors), sizes)
+    worst = ft.reduce(jnp.maximum, jax.tree.leaves(ratios))
+    lane = sum(jnp.sum(x) for x in jax.tree.leaves(step.y))
+    worst = once(_of_all_directions(jnp.where(step.kept & (worst < jnp.inf), worst, 0), lane) / SLACK)
+    # Far below the tolerance the error of one step says little of the next.
+    far = jnp.where(worst > 0.1, step.length * jnp.maximum(worst, 0.1) ** (-1 / order), jnp.inf)
+    far = jnp.maximum(far, _surely(worst > 1, step))
+    return jnp.minimum(far, trusted(*primals)), jnp.zeros_like(far)
+
+
+def _surely(doubted: Bool[Array, ""], step: Sensed) -> Scalar:
+    """The length over which no derivative of this mode turns by more than `NEVER_BELOW`. Where terms cancel, as in a
+    mode that is held, derivatives that are zero are rounding, which no step is short enough to resolve."""
+    dynamic, static = eqx.partition((step.model, step.state, step.t, step.y), eqx.is_array)
+
+    def length(dynamic: Any) -> Scalar:
+        model, state, t, y = eqx.combine(dynamic, static)
+        x, unravel = jfu.ravel_pytree(y)
+        m = jax.jacfwd(lambda x: jfu.ravel_pytree(model.flow(t, unravel(x), state))[0])(x)
+        size, rate = jnp.ones_like(t), jnp.full_like(t, jnp.inf)
+        for power in (1, 2, 4, 8):  # |m^k|^(1/k): what is nilpotent has no rate
+            norm = jnp.max(jnp.sum(jnp.abs(m), axis=1))
+            size = size * norm ** (1 / power)
+            rate = jnp.minimum(rate, size)
+            m = m / jnp.where(norm > 0, norm, 1)
+            m = m @ m
+        return jnp.where(rate > 0, NEVER_BELOW / jnp.where(rate > 0, rate, 1), jnp.inf)
+
+    return compact_cond(doubted, length, (dynamic,), jnp.zeros_like(step.t))
