@@ -323,7 +323,7 @@ class Flow(eqx.Module):
             halted=halted,
             halvings=step.halvings,
             crawled=crawled,
-            swing=largest_so_far(c.swing, y),
+            swing=largest_so_far(c.swing, c.y),
             grazed=grazed,
             forked=forked,
             margin=jnp.minimum(c.margin, jnp.where(c.active, there.margin, jnp.inf)),

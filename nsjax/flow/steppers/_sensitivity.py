@@ -9,15 +9,16 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.flatten_util as jfu
+import jax.lax as lax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
 
 from ..._numerics._autodiff import frozen
 from ..._numerics._barrier import once, stored
-from ..._numerics._lane_cond import compact_cond
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
@@ -96,7 +97,7 @@ def _trusted_jvp(primals: Any, tangents: Any) -> tuple[Scalar, Scalar]:
     # (A derivative of zero has no error, and one that does not exist must not end the solution.)
     floor = atol * largest + jnp.finfo(step.t.dtype).tiny
     ratios = jax.tree.map(lambda e, size: jnp.max(jnp.abs(e) / (floor + rtol * size)), stored(errors), sizes)
-    worst = ft.reduce(jnp.maximum, jax.tree.leaves(ratios))
+    worst = once(ft.reduce(jnp.maximum, jax.tree.leaves(ratios)))  # for each direction, not in one kernel for all
     lane = sum(jnp.sum(x) for x in jax.tree.leaves(step.y))
     worst = once(_of_all_directions(jnp.where(step.kept & (worst < jnp.inf), worst, 0), lane) / SLACK)
     # Far below the tolerance the error of one step says little of the next.
@@ -123,4 +124,5 @@ def _surely(doubted: Bool[Array, ""], step: Sensed) -> Scalar:
             m = m @ m
         return jnp.where(rate > 0, NEVER_BELOW / jnp.where(rate > 0, rate, 1), jnp.inf)
 
-    return compact_cond(doubted, length, (dynamic,), jnp.zeros_like(step.t))
+    none = jnp.zeros_like(step.t)
+    return jnp.where(doubted, lax.cond(eqxi.unvmap_any(doubted), length, lambda _: none, dynamic), none)
