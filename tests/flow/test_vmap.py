@@ -149,7 +149,7 @@ def test_every_lane_has_its_own_result():
 @pytest.mark.slow
 def test_map_in_batches_and_nested_vmap():
     v, x = lanes(64)
-    batch, _ = many(v, x)
+    batch = jax.jit(jax.vmap(one))(v, x)
     chunks = jax.jit(lambda v, x: lax.map(lambda p: one(*p), (v, x), batch_size=16))(v, x)
     nested = jax.jit(jax.vmap(jax.vmap(one)))(v.reshape(8, 8), x.reshape(8, 8))
     for other in (chunks, jax.tree.map(lambda a: a.reshape(64, *a.shape[2:]), nested)):
