@@ -1,7 +1,7 @@
 """The error of derivatives in the choice of steps: forward sensitivities are kept to a tolerance of their own.
 
 Where the state stands still its error says nothing, and steps that it alone had chosen would grow without bound; the
-derivatives at an equilibrium move all the same. Without differentiation none of this is in the program.
+derivatives at an equilibrium move all the same. Without differentiation nothing limits the steps but the state.
 """
 
 import functools as ft
