@@ -5,12 +5,12 @@ from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._barrier import once
+from .._numerics._while_any import while_any
 from .._types import Scalar, Y
 from ..system._model import SwitchedSystem
 from .steppers._stepper import bernstein
@@ -166,15 +166,7 @@ class Saved(eqx.Module):
             saved = saved.write(now, t, bernstein(points, u), mode, model)
             return eqx.tree_at(lambda s: s.next, saved, saved.next + now.astype(jnp.int32))
 
-        dynamic, static = eqx.partition(self, eqx.is_array)
-        options = dict(kind="checkpointed", max_steps=len(times)) if reverse else dict(kind="lax")
-        dynamic = eqxi.while_loop(
-            lambda d: eqxi.unvmap_any(due(eqx.combine(d, static))),
-            lambda d: eqx.filter(save(eqx.combine(d, static)), eqx.is_array),
-            dynamic,
-            **options,
-        )
-        return eqx.combine(dynamic, static)
+        return while_any(due, save, self, dict(max_steps=len(times)) if reverse else None)
 
     def write_step(self, when: Any, index: Any, t0: Scalar, t1: Scalar, points: Y) -> "Saved":
         if self.dense is None:

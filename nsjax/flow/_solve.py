@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -19,6 +18,7 @@ from .._numerics._jaxpr import bends_and_jumps, jumps
 from .._numerics._linalg import WRITTEN_OUT
 from .._numerics._merge import merged
 from .._numerics._text import known, suggesting
+from .._numerics._while_any import while_any
 from .._numerics._whole_loops import ask_for_whole_loops
 from .._types import Scalar, StateT, Y
 from ..system._checks import check_model, closing_contacts
@@ -196,19 +196,12 @@ def _first_turn(flow: Flow, y: Y, state: ModeState, forked: Any, result: RESULTS
 
 def _looped(flow: Flow, carry: Carry, adjoint: dfx.AbstractAdjoint) -> Carry:
     """The end of the loop."""
-    dynamic, static = eqx.partition(carry, eqx.is_array)
-
-    def body(dynamic: Any) -> Any:
-        new = eqx.filter(flow.body(eqx.combine(dynamic, static)), eqx.is_array)
-        return jax.tree.map(lambda old, x: x.astype(old.dtype), dynamic, new)
-
-    kind = dict(kind="lax")
+    checkpointed = None
     if isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
-        kind = dict(kind="checkpointed", max_steps=flow.max_steps, checkpoints=adjoint.checkpoints)
-    # `unvmap_any` keeps the predicate unbatched, so that ended lanes cost no copy of the buffers. Where it depends on
-    # one number of the carry alone, XLA looks for a count of the turns in it, which takes a quarter of the compilation.
-    dynamic = eqxi.while_loop(lambda c: eqxi.unvmap_any(c.active & (c.steps >= 0)), body, dynamic, **kind)
-    c: Carry = eqx.combine(dynamic, static)
+        checkpointed = dict(max_steps=flow.max_steps, checkpoints=adjoint.checkpoints)
+    # Where the predicate depends on one number of the carry alone, XLA looks for a count of the turns in it, which
+    # takes a quarter of the compilation.
+    c = while_any(lambda c: c.active & (c.steps >= 0), flow.body, carry, checkpointed)
     flow.meter.close(c.meter)
     return c
 
