@@ -4,8 +4,9 @@ from typing import Any
 
 import jax
 import jax.lax as lax
-import jax.numpy as jnp
 from jaxtyping import Array
+
+from ._select import select
 
 
 def once(tree: Any) -> Any:
@@ -17,7 +18,7 @@ def once(tree: Any) -> Any:
     """
 
     def leaf(x: Array) -> Array:
-        return x / jnp.where(x == x, 1, lax.stop_gradient(x))
+        return x / select(x == x, 1, lax.stop_gradient(x))
 
     return jax.tree.map(leaf, tree)
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Scalar
 
 from ._barrier import once
+from ._select import select
 
 
 UNROLLED = 3  # steps of Halley's method on a root before a loop takes over
@@ -64,9 +65,9 @@ def deflate(a: list[Array], roots: Int[Array, "..."]) -> list[Array]:
     # A second root within rounding of the first cannot be told from a double one.
     double = jnp.abs(first[0]) <= 1e-10 * once(largest(first))
     third = roots == 3
-    many = [jnp.where(third, x, y) for x, y in zip(_divided(second), second)]
+    many = [select(third, x, y) for x, y in zip(_divided(second), second)]
     none, simple = roots == 0, (roots == 1) & ~double
-    return once([jnp.where(none, x, jnp.where(simple, y, z)) for x, y, z in zip(a, first, many)])
+    return once([select(none, x, select(simple, y, z)) for x, y, z in zip(a, first, many)])
 
 
 def largest(a: list[Array]) -> Array:
@@ -91,8 +92,8 @@ def bend(a: list[Array], u: Scalar) -> Scalar:
     c = [x / w for x, w in zip(a, binomials(n))]
     c = [w * (z - 2 * y + x) for w, x, y, z in zip(binomials(n - 2), c, c[1:], c[2:])]
     early = u < 0.5
-    c = [jnp.where(early, x, y) for x, y in zip(c, c[::-1])]
-    return _horner(c, jnp.where(early, u, 1 - u) / jnp.where(early, 1 - u, u))
+    c = [select(early, x, y) for x, y in zip(c, c[::-1])]
+    return _horner(c, select(early, u, 1 - u) / select(early, 1 - u, u))
 
 
 def at(a: list[Array], u: Array) -> Array:
@@ -137,7 +138,7 @@ def _polish(a: list[Scalar], wanted: Bool[Array, ""]) -> Scalar:
     The first steps are unrolled, being all that most roots need; for the others a loop goes on.
     """
     late = once(sum(a[1:], a[0])) > 0
-    a = [once(jnp.where(late, -y, x)) for x, y in zip(a, a[::-1])]
+    a = [once(select(late, -y, x)) for x, y in zip(a, a[::-1])]
     n, eps = len(a) - 1, jnp.finfo(a[0].dtype).eps
 
     def improve(state: tuple) -> tuple:
@@ -149,8 +150,8 @@ def _polish(a: list[Scalar], wanted: Bool[Array, ""]) -> Scalar:
             value, slope, bend = value * x + c, slope * x + value, bend * x + slope
         # The same by u, up to the factor w^n.
         slope, bend = w * (w * slope - n * value), w * w * (w * w * bend - (n - 1) * (w * slope - 0.5 * n * value))
-        low = jnp.where(value > 0, u, low)
-        high = jnp.where(value > 0, high, u)
+        low = select(value > 0, u, low)
+        high = select(value > 0, high, u)
         newton = value / slope
         ratio = newton * bend / slope  # of the curvature to the slope over the way that is left
         step = newton / (1 - ratio)
@@ -161,7 +162,7 @@ def _polish(a: list[Scalar], wanted: Bool[Array, ""]) -> Scalar:
         step, ratio = jnp.abs(step), jnp.abs(ratio)
         trusted = inside & (ratio <= 0.5) & ((count % 3 != 2) | (step < 1e-2))
         exact = (value == 0) & (slope < 0)
-        new = jnp.where(done | exact, u, jnp.where(trusted, guess, 0.5 * (low + high)))
+        new = select(done | exact, u, select(trusted, guess, 0.5 * (low + high)))
         # The error that is left is the step times the square of the ratio, and where the curvature vanishes times that
         # of the step, by the third derivative.
         rest = (ratio * ratio + (n * step) ** 2) * step
@@ -174,12 +175,12 @@ def _polish(a: list[Scalar], wanted: Bool[Array, ""]) -> Scalar:
 
     # A root at the very end is no place to start: an earlier one may be meant, and there the sign is rounding.
     secant = 0.5 * a[0] / (a[0] - 0.5**n * sum(a[1:], a[0]))
-    guess = once(jnp.where(secant > 0.005, secant, 0.25))
+    guess = once(select(secant > 0.005, secant, 0.25))
     state = (jnp.zeros_like(guess), jnp.full_like(guess, 0.5), guess, ~wanted, jnp.zeros((), jnp.int32))
     for _ in range(UNROLLED):
         state = improve(state)
     u = jax.lax.while_loop(busy, improve, state)[2]
-    return jnp.where(late, 1 - u, u)
+    return select(late, 1 - u, u)
 
 
 def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar]:
@@ -218,15 +219,15 @@ def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar
         moved = after
         for shift in (32, 16, 8, 4, 2, 1)[0 if wide else 1 :]:
             even = (moved & ((1 << shift) - 1)) == 0
-            up = up + jnp.where(even, shift, 0)
-            moved = jnp.where(even, moved >> shift, moved)
+            up = up + select(even, shift, 0)
+            moved = select(even, moved >> shift, moved)
         up = jnp.minimum(up, level)
         over = free & ((after >> level) == 1)
-        level, index = jnp.where(free, level - up, level + 1), jnp.where(free, after >> up, 2 * index)
+        level, index = select(free, level - up, level + 1), select(free, after >> up, 2 * index)
         start, width = index.astype(dtype), 0.5 ** level.astype(dtype)
         weights = jnp.asarray(binomials(n), dtype)
         local = _restrict(jnp.stack(a, axis=-1) / weights, start * width, (start + 1) * width) * weights
-        local = [jnp.where(level == 0, x, local[:, j]) for j, x in enumerate(a)]
+        local = [select(level == 0, x, local[:, j]) for j, x in enumerate(a)]
         return level, index, local, *look(local, level), over
 
     free, sure = look(a, zero)
@@ -236,9 +237,9 @@ def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar
     part = jnp.argmax((local[0] > 0) & (local[-1] <= 0))
     chosen = [x[part] if len(x) > 1 else x[0] for x in local]
     polished = found & (chosen[0] > 0) & (chosen[-1] <= 0)
-    place = jnp.where(polished, _polish(chosen, polished), jnp.where(begun, 0.0, 0.5))
+    place = select(polished, _polish(chosen, polished), select(begun, 0.0, 0.5))
     root = (index.astype(dtype) + place) * 0.5 ** level.astype(dtype)
-    return found, jnp.where(found, root, one)
+    return found, select(found, root, one)
 
 
 FEW = 4  # polynomials looked at together, of many
@@ -255,9 +256,9 @@ def first_roots(a: list[Float[Array, "polynomials parts"]]) -> tuple[Bool[Array,
 
     def look(carry: tuple) -> tuple:
         left, found, root = carry
-        key, place = jax.lax.top_k(jnp.where(left, order, -jnp.inf), FEW)  # the first ones that are left
+        key, place = jax.lax.top_k(select(left, order, -jnp.inf), FEW)  # the first ones that are left
         new = jax.vmap(first_root)([x.at[place].get(mode="clip") for x in a])
-        place = jnp.where(key > -jnp.inf, place, count)  # what is none of them is dropped
+        place = select(key > -jnp.inf, place, count)  # what is none of them is dropped
         left, found, root = (x.at[place].set(y, mode="drop") for x, y in zip(carry, (False, *new)))
         return left, found, root
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 
 from ._inner import batched_outputs, mapped, moving, opened, pushed_forward, REACHED, replacing, spread, with_zeros
+from ._select import select
 
 
 _GROUP = 32  # lanes worked on together, at least; a kernel costs as much to start as for some hundred lanes
@@ -53,7 +54,7 @@ def _gathered(pred: Any, inputs: list, axes: list, default: list, branch: Callab
     rank = jnp.cumsum(pred.astype(jnp.int32))
     total = rank[-1]
     order = jnp.full(lanes + group, lanes, jnp.int32)
-    order = order.at[jnp.where(pred, rank - 1, lanes + group)].set(jnp.arange(lanes, dtype=jnp.int32), mode="drop")
+    order = order.at[select(pred, rank - 1, lanes + group)].set(jnp.arange(lanes, dtype=jnp.int32), mode="drop")
 
     def work(carry: tuple) -> tuple:
         start, results = carry

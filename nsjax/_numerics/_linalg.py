@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar
 from ._autodiff import frozen
+from ._select import select
 
 
 WRITTEN_OUT = 3
@@ -98,16 +99,16 @@ def _eliminate(a: Float[Array, "m m lanes"], b: Float[Array, "m lanes"]) -> Floa
     def column(j: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         rows, free, x_of = carry  # which rows were no pivots yet, and of which unknown the others are
         here = rows[:, j]
-        pivot = jnp.argmax(jnp.where(free, jnp.abs(here), -1), axis=0).astype(jnp.int32) == index
-        line = jnp.sum(jnp.where(pivot[:, None], rows, 0), axis=0)
+        pivot = jnp.argmax(select(free, jnp.abs(here), -1), axis=0).astype(jnp.int32) == index
+        line = jnp.sum(select(pivot[:, None], rows, 0), axis=0)
         line = line / line[j]
-        rows = jnp.where(pivot[:, None], line, rows - here[:, None] * line)
-        return rows, free & ~pivot, jnp.where(pivot, j, x_of)
+        rows = select(pivot[:, None], line, rows - here[:, None] * line)
+        return rows, free & ~pivot, select(pivot, j, x_of)
 
     rows = jnp.concatenate([a, b[:, None]], axis=1)
     start = rows, jnp.ones(b.shape, bool), jnp.zeros(b.shape, jnp.int32)
     rows, _, x_of = lax.fori_loop(0, len(b), column, start)
-    return jnp.sum(jnp.where(x_of == index[:, None], rows[:, -1], 0), axis=1)
+    return jnp.sum(select(x_of == index[:, None], rows[:, -1], 0), axis=1)
 
 
 def parallel(a: Any, b: Any) -> Bool[Array, ""]:
@@ -138,7 +139,7 @@ def _scales(a: Float[Array, "m m"]) -> tuple[Float[Array, " m"], Float[Array, " 
     entries).
     """
     there = (a != 0).astype(a.dtype)
-    size = there * jnp.log2(jnp.where(a == 0, 1, jnp.abs(a)))
+    size = there * jnp.log2(select(a == 0, 1, jnp.abs(a)))
     by_row, by_column = (jnp.maximum(jnp.sum(there, axis), 1) for axis in (1, 0))
     rows, columns = jnp.zeros_like(a[0]), jnp.zeros_like(a[0])
     for _ in range(4):

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar
 from ._barrier import once
+from ._select import select
 
 
 NODES = 40  # parts of a piece: they resolve a phase of 7.6, somewhat more than a period
@@ -128,18 +129,18 @@ def minima(
         lower = ~rough & ((least < old.least) | jnp.isnan(least))  # what cannot be told is not told wrong
         first = walk.width == 1
         found = Minima(
-            least=jnp.where(lower, least, old.least),
-            share=jnp.where(lower, share, old.share),
-            x=jnp.where(lower[:, None], states, old.x),
+            least=select(lower, least, old.least),
+            share=select(lower, share, old.share),
+            x=select(lower[:, None], states, old.x),
             most=most,
-            sums=jax.tree.map(lambda a, b: a + jnp.where(rough, 0, b), old.sums, sums),
-            ts=jnp.where(first, ts, old.ts),
-            xs=jnp.where(first, xs, old.xs),
+            sums=jax.tree.map(lambda a, b: a + select(rough, 0, b), old.sums, sums),
+            ts=select(first, ts, old.ts),
+            xs=select(first, xs, old.xs),
         )
-        begin = jnp.where(rough, walk.begin, end)
+        begin = select(rough, walk.begin, end)
         calm = jnp.all((missed <= CALM * allowed) | too_high)
-        width = walk.width * jnp.where(rough, 0.5, jnp.where(calm, 2, 1))
-        x_next = jnp.where(rough, walk.x, xs[-1])
+        width = walk.width * select(rough, 0.5, select(calm, 2, 1))
+        x_next = select(rough, walk.x, xs[-1])
         return _Walk(begin, jnp.minimum(width, 1 - begin), x_next, seen, found)
 
     # (A function that is NaN counts as resolved, so that the walk ends. The second condition follows from the first:
@@ -174,17 +175,17 @@ def divided(values: Array, share: Array, orders: Array) -> Array:
     """By zeros at both ends, of these orders; infinite right beside them."""
     below, beside = jnp.ones_like(share), jnp.zeros(share.shape, bool)
     for order, s in ((orders[0], share), (orders[1], 1 - share)):
-        below = below * jnp.where(order == 0, 1, jnp.where(order == 1, s, jnp.where(order == 2, s**2, s**3)))
+        below = below * select(order == 0, 1, select(order == 1, s, select(order == 2, s**2, s**3)))
         beside = beside | ((order > 0) & (s < BESIDE))
     beside = beside | (below < 1e-9)
-    return jnp.where(beside, jnp.inf, values / jnp.where(beside, 1, below))
+    return select(beside, jnp.inf, values / select(beside, 1, below))
 
 
 def _interpolated(values: Float[Array, "parts nodes"], phi: Scalar) -> Float[Array, " parts"]:
     """The polynomials through the values at the nodes, by the barycentric formula."""
     off = jnp.cos(phi) - jnp.asarray(np.cos(_PHI), phi.dtype)
-    weights = jnp.asarray(_BARYCENTRIC, phi.dtype) / jnp.where(off == 0, 1, off)
-    weights = jnp.where(jnp.any(off == 0), (off == 0).astype(phi.dtype), weights)
+    weights = jnp.asarray(_BARYCENTRIC, phi.dtype) / select(off == 0, 1, off)
+    weights = select(jnp.any(off == 0), (off == 0).astype(phi.dtype), weights)
     return values @ weights / jnp.sum(weights)
 
 
@@ -196,7 +197,7 @@ def _missed(values: Float[Array, "functions parts nodes"]) -> Float[Array, " fun
 def _least(x: Float[Array, " n"]) -> tuple[Scalar, Array]:
     """The least number, and where it is first. (XLA's own search for the place is slow on CPUs.)"""
     least, index = jnp.min(x), jnp.arange(len(x), dtype=jnp.int32)
-    return least, jnp.min(jnp.where(x == least, index, len(x) - 1))
+    return least, jnp.min(select(x == least, index, len(x) - 1))
 
 
 def _beside(d: Float[Array, "3"]) -> Scalar:
@@ -204,7 +205,7 @@ def _beside(d: Float[Array, "3"]) -> Scalar:
     first, second = d[1] - d[0], d[2] - d[0]
     c = (second - 4 * first) / 12
     b = jnp.minimum(first - c, 0)
-    return jnp.where(jnp.isfinite(second) & (c > 0), b**2 / jnp.where(c > 0, 2 * c, 1), 0)
+    return select(jnp.isfinite(second) & (c > 0), b**2 / select(c > 0, 2 * c, 1), 0)
 
 
 def _lowest(
@@ -221,24 +222,24 @@ def _lowest(
     edge = jnp.full((1,), jnp.inf, d.dtype)
     before, after = jnp.concatenate([edge, d[:-1]]), jnp.concatenate([d[1:], edge])
     dip = (d <= before) & (d <= after) & jnp.isfinite(d)
-    left, right = (jnp.where(jnp.isfinite(side), side - d, 0) for side in (before, after))
+    left, right = (select(jnp.isfinite(side), side - d, 0) for side in (before, after))
     inside = jnp.isfinite(before) & jnp.isfinite(after)
-    bend = jnp.where(inside, left + right, 1)
+    bend = select(inside, left + right, 1)
     # Twice as deep as the parabola's, for half waves of two nodes.
-    depth = jnp.where(inside, (right - left) ** 2 / jnp.where(bend > 0, 4 * bend, 1) + 0.05 * bend, (left + right) / 2)
+    depth = select(inside, (right - left) ** 2 / select(bend > 0, 4 * bend, 1) + 0.05 * bend, (left + right) / 2)
     depth = depth.at[0].add(_beside(d[:3])).at[-1].add(_beside(d[:-4:-1]))
-    bound = jnp.where(dip, d - depth, jnp.inf)
-    bound = jnp.where(bound < below, bound, jnp.inf)
-    rounding = 64 * jnp.finfo(d.dtype).eps * jnp.max(jnp.abs(jnp.where(jnp.isfinite(d), d, 0)))
+    bound = select(dip, d - depth, jnp.inf)
+    bound = select(bound < below, bound, jnp.inf)
+    rounding = 64 * jnp.finfo(d.dtype).eps * jnp.max(jnp.abs(select(jnp.isfinite(d), d, 0)))
 
     def bottom(i: Array) -> Scalar:
         """Where a dip is lowest, by polynomials for its parts."""
         near = jnp.abs(i + jnp.asarray(_LOCAL, i.dtype))  # (both ends are mirrors)
         here = i.astype(d.dtype)
         local = jnp.asarray(_TO_POWERS, d.dtype) @ values.T[NODES - jnp.abs(NODES - near)]
-        low = jnp.where(jnp.isfinite(before[i]), -1.0, 0.0).astype(d.dtype)
-        high = jnp.where(jnp.isfinite(after[i]), 1.0, 0.0).astype(d.dtype)
-        at_end, inwards = (i == 0) | (i == NODES), jnp.where(i == 0, 1, -1)
+        low = select(jnp.isfinite(before[i]), -1.0, 0.0).astype(d.dtype)
+        high = select(jnp.isfinite(after[i]), 1.0, 0.0).astype(d.dtype)
+        at_end, inwards = (i == 0) | (i == NODES), select(i == 0, 1, -1)
 
         def at(u: Array) -> Array:
             parts = ft.reduce(lambda total, c: total * u[..., None] + c, local[::-1])
@@ -249,12 +250,12 @@ def _lowest(
 
         def refine(_: Any, u: Scalar) -> Scalar:
             rate, bend = jax.jvp(slope, (u,), (jnp.ones_like(u),))
-            new = jnp.clip(u - jnp.where(bend > 0, rate / jnp.where(bend > 0, bend, 1), 0), low, high)
+            new = jnp.clip(u - select(bend > 0, rate / select(bend > 0, bend, 1), 0), low, high)
             # About an end it is even in u, which hides a dip beside it: a function of u², with these derivatives.
-            safe = jnp.where(at_end, u, 1)
+            safe = select(at_end, u, 1)
             rate, bend = rate / (2 * safe), (bend - rate / safe) / (4 * safe**2)
-            square = jnp.clip(u**2 - jnp.where(bend > 0, rate / jnp.where(bend > 0, bend, 1), 0), 1e-8, 1)
-            return jnp.where(at_end, inwards * jnp.sqrt(square), new)
+            square = jnp.clip(u**2 - select(bend > 0, rate / select(bend > 0, bend, 1), 0), 1e-8, 1)
+            return select(at_end, inwards * jnp.sqrt(square), new)
 
         def narrow(_: Any, window: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
             points = jnp.linspace(*window, 7, dtype=d.dtype)
@@ -264,7 +265,7 @@ def _lowest(
         if several:  # where two parts meet it has a kink
             u = 0.5 * sum(lax.fori_loop(0, NARROWINGS, narrow, (low, high)))
         else:
-            u = lax.fori_loop(0, REFINEMENTS, refine, jnp.where(at_end, 0.5 * inwards, 0).astype(d.dtype))
+            u = lax.fori_loop(0, REFINEMENTS, refine, select(at_end, 0.5 * inwards, 0).astype(d.dtype))
         return (here + u) * _SPACING
 
     def deepen(state: tuple) -> tuple:
@@ -273,8 +274,8 @@ def _lowest(
         value = whole(_interpolated(values, phi), phi)
         lower = value < least
         # (Dips with the same bound, to the last digit, are those of a symmetry.)
-        rest = jnp.where(bound > next_bound, bound, jnp.inf)
-        return jnp.where(lower, value, least), jnp.where(lower, phi, place), *_least(rest)
+        rest = select(bound > next_bound, bound, jnp.inf)
+        return select(lower, value, least), select(lower, phi, place), *_least(rest)
 
     def deeper(state: tuple) -> Array:
         least, _, next_bound, _ = state

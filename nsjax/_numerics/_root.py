@@ -12,6 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool
 
 from ._autodiff import dense_jacobian, frozen
+from ._select import select
 
 
 class Newton(NamedTuple):
@@ -85,4 +86,4 @@ def _implicit_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     if dr is None:
         return z, jnp.zeros_like(z)
     move = lx.linear_solve(lx.MatrixLinearOperator(jacobian), -dr, solver=lx.LU(), throw=False).value
-    return z, jnp.where(regular, move, jnp.nan)
+    return z, select(regular, move, jnp.nan)

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ._barrier import once
+from ._select import select
 
 
 Coefficient = Array | None  # None is zero
@@ -200,7 +201,7 @@ class Series:
         if name in ("max", "min"):
             a, b = (self.full(self.term(i, 0), v) for i, v in zip(operands, e.invars))
             first = a >= b if name == "max" else a <= b
-            return [jnp.where(first, *(self.full(c, v) for c, v in zip(new, e.invars)))]
+            return [select(first, *(self.full(c, v) for c, v in zip(new, e.invars)))]
         if name == "abs":
             return [None if new[0] is None else jnp.sign(self.full(self.term(operands[0], 0), e.invars[0])) * new[0]]
         if name == "rem":

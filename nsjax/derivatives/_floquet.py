@@ -7,6 +7,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from .._numerics._select import select
 from ..system._system import System
 
 
@@ -19,7 +20,7 @@ def structural_zeros(system: System, modes: Int[Array, "arcs switches"]) -> Int[
     lost = jnp.zeros(len(modes), jnp.int32)
     for k, switch in enumerate(system.switches):
         if switch.order:
-            lost += jnp.where(modes[:, k] == switch.holding, switch.order, 0).astype(lost.dtype)
+            lost += select(modes[:, k] == switch.holding, switch.order, 0).astype(lost.dtype)
     return jnp.max(lost)
 
 
@@ -51,7 +52,7 @@ def _triangular(factors: Float[Array, "factors n n"]) -> Float[Array, "n n"]:
     rs = rs + (turned - lax.stop_gradient(turned))  # triangular, with the derivatives of what is not
     around = q.T @ last
     eps = float(jnp.finfo(factors.dtype).eps)
-    around = jnp.where(jnp.tril(jnp.abs(around) <= 1e3 * eps, -1), 0, around)
+    around = select(jnp.tril(jnp.abs(around) <= 1e3 * eps, -1), 0, around)
     return around @ product(rs)
 
 
@@ -65,7 +66,7 @@ def _qr(a: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, "n n"
         for i in range(n - 1, j, -1):
             x, y = r[i - 1][j], r[i][j]
             h = jnp.hypot(x, y)
-            c, s = jnp.where(h > 0, x / jnp.where(h > 0, h, 1), 1), jnp.where(h > 0, y / jnp.where(h > 0, h, 1), 0)
+            c, s = select(h > 0, x / select(h > 0, h, 1), 1), select(h > 0, y / select(h > 0, h, 1), 0)
             for rows in (r, q):
                 rows[i - 1], rows[i] = c * rows[i - 1] + s * rows[i], c * rows[i] - s * rows[i - 1]
             r[i] = r[i].at[j].set(0)
@@ -117,9 +118,9 @@ def floquet(
     triangular = _triangular(factors)
     finite = jnp.all(jnp.isfinite(triangular))
     eye = jnp.eye(monodromy.shape[-1], dtype=monodromy.dtype)
-    multipliers = jnp.where(finite, eigenvalues(jnp.where(finite, triangular, eye)), jnp.nan)
+    multipliers = select(finite, eigenvalues(select(finite, triangular, eye)), jnp.nan)
     n = len(multipliers)
-    multipliers = jnp.where(finite & (jnp.arange(n, dtype=zeros.dtype) >= n - zeros), 0, multipliers)
+    multipliers = select(finite & (jnp.arange(n, dtype=zeros.dtype) >= n - zeros), 0, multipliers)
     return monodromy, multipliers, stability(multipliers, autonomous)
 
 
@@ -151,7 +152,7 @@ def forwards(
     """
     monodromy, multipliers, _ = backwards
     lost = zeros > 0
-    inverse = jnp.linalg.inv(jnp.where(lost, jnp.eye(len(monodromy), dtype=monodromy.dtype), monodromy))
+    inverse = jnp.linalg.inv(select(lost, jnp.eye(len(monodromy), dtype=monodromy.dtype), monodromy))
     vanishes = multipliers == 0
-    multipliers = jnp.where(vanishes, jnp.inf, 1 / jnp.where(vanishes, 1, multipliers))[::-1]
-    return jnp.where(lost, jnp.inf, inverse), multipliers, stability(multipliers, autonomous)
+    multipliers = select(vanishes, jnp.inf, 1 / select(vanishes, 1, multipliers))[::-1]
+    return select(lost, jnp.inf, inverse), multipliers, stability(multipliers, autonomous)

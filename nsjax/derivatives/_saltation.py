@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._numerics._autodiff import frozen
+from .._numerics._select import select
 from .._types import Scalar, Y
 from ..flow._arguments import checked_state, checked_time
 from ..flow._solution import Events
@@ -41,7 +42,7 @@ def event_function(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeSt
         return surface
     lam = model.values(t, y, state)[k]
     left = lam if k in model.contacts else model.bound(k) - jnp.sign(lam) * lam
-    return jnp.where(model.held(k, state.mode[k]), left, surface)
+    return select(model.held(k, state.mode[k]), left, surface)
 
 
 def after_event(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState, after: tuple) -> tuple[Y, Scalar]:
@@ -56,10 +57,10 @@ def after_event(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState
     flight = model.state_at(t, bounced, after[:k] + (free,) + after[k + 1 :])
     end = completed(model, k, t, y, bounced, state, flight)
     lands, rests = state.mode[k] == 0, after[k] == 1  # to lift off is no jump
-    rest = jnp.where(rests, end.rest, 0)
+    rest = select(rests, end.rest, 0)
     held = _held(model, t + rest, end.y, after)
-    out = jax.tree.map(lambda a, b, c: jnp.where(lands, jnp.where(rests, a, b), c), held, bounced, y)
-    return out, jnp.where(lands, rest, none)
+    out = jax.tree.map(lambda a, b, c: select(lands, select(rests, a, b), c), held, bounced, y)
+    return out, select(lands, rest, none)
 
 
 def _held(model: SwitchedSystem, t: Scalar, y: Y, mode: tuple) -> Y:
@@ -100,7 +101,7 @@ def _jump(model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after: 
     x, rest = hit(t, flat)
     if isinstance(model.switches[k], impact):
         rests = (before[k] == 0) & (after[k] == 1)
-        onto = jnp.where(rests, jax.jacfwd(lambda x: ravel(_held(model, t + rest, unravel(x), after)))(x), onto)
+        onto = select(rests, jax.jacfwd(lambda x: ravel(_held(model, t + rest, unravel(x), after)))(x), onto)
     later = model.state_at(t, unravel(x), after)
     f_after = ravel(model.flow(t, unravel(x), later))
     still, at, begin, end, drift = frozen((model, t, flat, x, jnp.abs(t * f_before)))
@@ -120,7 +121,7 @@ def _part(x: Array) -> Array:
 
 def _unless_rounding(x: Array, blur: Array) -> Array:
     """Zero where terms cancel apart from their rounding; the derivative stays: next to it they need not cancel."""
-    return x - lax.stop_gradient(jnp.where(jnp.abs(x) < blur, x, 0))
+    return x - lax.stop_gradient(select(jnp.abs(x) < blur, x, 0))
 
 
 def _matrix(model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Float[Array, "n n"]:
@@ -137,7 +138,7 @@ def _matrix(model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after
     # At a tangency the matrix is infinite, but what does not depend on the time of the event stays as it is.
     speed = j.n @ j.f_before + j.h_t
     none = (turn == 0) & (speed == 0)
-    terms = j.dr, -jnp.outer(j.f_after, j.drest), jnp.where(none, 0, turn / jnp.where(none, 1, speed))
+    terms = j.dr, -jnp.outer(j.f_after, j.drest), select(none, 0, turn / select(none, 1, speed))
     size = sum(map(jnp.abs, terms), jnp.zeros_like(turn))
     jump = _unless_rounding(sum(terms, jnp.zeros_like(turn)), _part(size))
     if not isinstance(model.switches[k], impact):

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._compile import interactive
+from .._numerics._select import select
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start, checked_time
 from ..flow._integrator import Integrator
@@ -98,14 +99,14 @@ def matrices_along(sol: Solution, y0: Y, ts: Any, integrator: Integrator, throw:
 def _checked(sol: Solution, t0: Scalar, times: Array, phi: Array, throw: bool) -> Array:
     """NaN, or an error, where there are no derivatives."""
     beyond = _beyond_grazing(sol, t0, times)
-    phi = jnp.where(beyond[:, None, None], jnp.nan, phi)
+    phi = select(beyond[:, None, None], jnp.nan, phi)
     return raise_if(jnp.any(beyond), RESULTS.tangential_event, phi) if throw else phi
 
 
 def _beyond_grazing(sol: Solution, t0: Scalar, times: Float[Array, " times"]) -> Bool[Array, " times"]:
     """Which times come after an event so tangential that there are no derivatives by what was before it."""
-    sign, events = jnp.where(sol.t1 >= t0, 1, -1), sol.events
-    first = jnp.min(jnp.where(events.transversality == 0, events.t * sign, jnp.inf), initial=jnp.inf)
+    sign, events = select(sol.t1 >= t0, 1, -1), sol.events
+    first = jnp.min(select(events.transversality == 0, events.t * sign, jnp.inf), initial=jnp.inf)
     return (sol.result == RESULTS.tangential_event) & ((times * sign > first) | (times == sol.t1))
 
 
@@ -119,7 +120,7 @@ def arcs(sol: Solution, t0: Scalar, y0: Y) -> tuple[Array, Array, Y, Array]:
     def rows(first: Any, later: Any, end: Any) -> Any:
         def leaf(a: Array, b: Array, c: Array) -> Array:
             held = happened.reshape((-1,) + (1,) * (b.ndim - 1))
-            return jnp.concatenate([a[None], jnp.where(held, b, c)])
+            return jnp.concatenate([a[None], select(held, b, c)])
 
         return jax.tree.map(leaf, first, later, end)
 
@@ -142,7 +143,7 @@ def _repeated(sol: Solution, t0: Scalar) -> Int[Array, ""]:
     at_once = (rows < events.num) & (jnp.abs(events.t - t0) <= AT_ONCE * jnp.abs(sol.t1 - t0))
     same = at_once & jnp.all(events.mode_after == sol.mode1, axis=1)
     closed = jnp.all(sol.mode0 == sol.mode1) | ~jnp.any(same)
-    return jnp.where(closed, 0, 1 + jnp.argmax(same)).astype(events.num.dtype)
+    return select(closed, 0, 1 + jnp.argmax(same)).astype(events.num.dtype)
 
 
 @interactive
@@ -166,7 +167,7 @@ def _by_arcs(
     if sol.events.t.size:
         index = jnp.arange(sol.events.t.size, dtype=sol.events.num.dtype)
         happened = (index >= skipped) & (index < sol.events.num)
-        later = jnp.where(happened[:, None, None], saltation_matrices(system, sol.events), eye)
+        later = select(happened[:, None, None], saltation_matrices(system, sol.events), eye)
         jumps = jnp.concatenate([jumps, later])
 
     def matrix(columns: Y) -> Array:
@@ -177,7 +178,7 @@ def _by_arcs(
         # On an arc that runs backwards so do the times.
         low, high = jnp.minimum(a, b), jnp.maximum(a, b)
         inside = jnp.clip(times, low, high)
-        order = jnp.argsort(jnp.where(b >= a, inside, -inside))
+        order = jnp.argsort(select(b >= a, inside, -inside))
         varied = y, jax.vmap(unravel, in_axes=1)(jump @ phi)
         out = integrate(smooth, a, b, varied, integrator, saveat=dfx.SaveAt(ts=inside[order]))
         along = jax.vmap(matrix)(out.ys[1])
@@ -191,6 +192,6 @@ def _by_arcs(
     there = jnp.arange(len(end), dtype=sol.events.num.dtype) <= sol.events.num
     whole, by_arc = lax.scan(turn, eye, (there, begin, end, state, modes, jumps))
     # Each time belongs to the arc that ends at or after it; the first one wins, so that Φ is that before a jump.
-    sign = jnp.where(sol.t1 >= t0, 1, -1)
+    sign = select(sol.t1 >= t0, 1, -1)
     index = jnp.clip(jnp.searchsorted(sign * end, sign * times, side="left"), 0, sol.events.num)
     return whole, by_arc[index, jnp.arange(len(times))]

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from .._numerics._autodiff import frozen
 from .._numerics._compile import interactive
 from .._numerics._root import find_root, Newton
+from .._numerics._select import select
 from .._numerics._text import listed, shown
 from .._types import Scalar, StateT, Y
 from ..derivatives._floquet import eigenvalues
@@ -105,7 +106,7 @@ def balance(model: SwitchedSystem, t: Scalar, y: Y, sigma: Array, state: ModeSta
     state, (2.19)-(2.20); and by how much the values of the others differ from their signs."""
     rest = model.signs(t, state)
     rows = [
-        jnp.where(model.held(k, state.mode[k]), _surface(model, k, t, y, state), sigma[i] - rest[k])
+        select(model.held(k, state.mode[k]), _surface(model, k, t, y, state), sigma[i] - rest[k])
         for i, k in enumerate(model.holdable)
     ]
     field = ravel(model.field(t, y, switch_values(model, t, state, sigma)))
@@ -126,7 +127,7 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, newton: Newton
 
     # Where a surface holds all along it, the values that keep it there are those of the nearest place.
     begin, signs = model.values(t, y0, state), model.signs(t, state)
-    sigma = [jnp.where(jnp.isfinite(begin[k]), begin[k], signs[k]) for k in holdable]
+    sigma = [select(jnp.isfinite(begin[k]), begin[k], signs[k]) for k in holdable]
     sigma = jnp.stack(sigma) if sigma else jnp.zeros(0, t.dtype)
     z, converged = find_root(residual, frozen((x0, sigma)), system, newton, well_posed=False)
     still = frozen(z)
@@ -176,21 +177,21 @@ def linear_motion(
     for k in model.holdable:
         on = model.held(k, state.mode[k])
         contact = k in model.contacts
-        held = held + jnp.where(on, 2 if contact else 1, 0)
+        held = held + select(on, 2 if contact else 1, 0)
         gradients = [jax.grad(lambda x, k=k: model.level(k, t, unravel(x), state))(x)]
         if contact:
             gradients.append(jax.grad(lambda x, k=k: _surface(model, k, t, unravel(x), state))(x))
         else:
             slope = jax.jacfwd(lambda v, k=k: model.rates((k,), t, y, state, s[:k] + (v,) + s[k + 1 :])[0])(s[k])
-            attracts = attracts & jnp.where(on, slope < 0, True)
-        normals += [jnp.where(on, g / jnp.linalg.norm(g), 0) for g in gradients]
+            attracts = attracts & select(on, slope < 0, True)
+        normals += [select(on, g / jnp.linalg.norm(g), 0) for g in gradients]
         taken += [on] * len(gradients)
     if not normals:
         return jacobian, jacobian, held, attracts
     # The normals N span a left invariant subspace, N J = T N: that is what being held means. So J - N⁺ (T + D) N has
     # -D for T, and the other eigenvalues of J.
     normal, on = jnp.stack(normals), jnp.stack(taken)
-    inverse = normal.T @ jnp.linalg.inv(normal @ normal.T + jnp.diag(jnp.where(on, 0, 1).astype(x.dtype)))
+    inverse = normal.T @ jnp.linalg.inv(normal @ normal.T + jnp.diag(select(on, 0, 1).astype(x.dtype)))
     far = 10 * (1 + jnp.max(jnp.abs(lax.stop_gradient(jacobian)))) * len(x)
     rates = jnp.diag(far * (1 + jnp.arange(len(normals), dtype=x.dtype)))
     return jacobian, jacobian - inverse @ (normal @ jacobian @ inverse + rates) @ normal, held, attracts
@@ -200,12 +201,12 @@ def free_eigenvalues(motion: Float[Array, "n n"], held: Int[Array, ""]) -> Compl
     """Largest real part first; those off the surfaces come last, and are NaN."""
     roots = eigenvalues(motion)
     order = jnp.argsort(-lax.stop_gradient(roots).real)
-    return jnp.where(_free(len(roots), held), roots[order], jnp.nan)
+    return select(_free(len(roots), held), roots[order], jnp.nan)
 
 
 def all_decay(roots: Complex[Array, " n"], held: Int[Array, ""]) -> Bool[Array, ""]:
     """Whether the eigenvalues of what can move have negative real parts."""
-    return jnp.all(jnp.where(_free(len(roots), held), roots.real < 0, True))
+    return jnp.all(select(_free(len(roots), held), roots.real < 0, True))
 
 
 def _free(n: int, held: Int[Array, ""]) -> Bool[Array, " n"]:
@@ -227,13 +228,13 @@ def _place(
         on = jnp.abs(h) <= slack
         if model.conditional(k):
             absent, off = model.absent(k, state.mode), mode == OFF
-            h, on = jnp.where(off, jnp.where(absent, 1, -1), jnp.where(absent, -1, h)), on & ~off
+            h, on = select(off, select(absent, 1, -1), select(absent, -1, h)), on & ~off
         side = (h >= -slack) if isinstance(switch, impact) else (mode.astype(h.dtype) * h >= -slack)
         if k not in model.holdable:
             admissible, boundary = admissible & side, boundary | on
             continue
         held = model.held(k, mode)
         within = s[k] >= -1e-9 if k in model.contacts else jnp.abs(s[k]) <= model.bound(k) * (1 + 1e-9)
-        admissible = admissible & jnp.where(held, within & (h >= -slack), side)
+        admissible = admissible & select(held, within & (h >= -slack), side)
         boundary = boundary | (on & ~held)
     return admissible, boundary

@@ -12,6 +12,7 @@ import numpy as np
 from .._numerics._compile import interactive
 from .._numerics._jaxpr import is_constant
 from .._numerics._root import Newton
+from .._numerics._select import select
 from .._types import StateT, Y
 from ..flow._arguments import checked_start
 from ..flow._results import raise_if, RESULTS
@@ -154,7 +155,7 @@ def _mode_of(model: SwitchedSystem, t: Any, y: Y) -> list[Any]:
             h = model.least(k, t, y)
             noise = jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y))
             on = 0 if k in model.holdable else 1
-            modes.append(jnp.where(jnp.abs(h) <= noise, on, jnp.sign(h)).astype(jnp.int32))
+            modes.append(select(jnp.abs(h) <= noise, on, jnp.sign(h)).astype(jnp.int32))
         else:
             modes.append(jnp.zeros((), jnp.int32))
     return modes

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._numerics._select import select
 from .._numerics._text import components, written
 from .._types import Y
 from ..system._checks import closing_contacts
@@ -61,7 +62,7 @@ def _pieces(system: Any, t: Any, y: Y, mode: Any) -> list[tuple[str, list[tuple[
         if h:
             out.append((f"`{owner}.{switch.name}`", [("h", value) for value in h]))
     signs = tuple(
-        jnp.where(x == 0, 1, x) if switch.order == 1 else x for switch, x in zip(model.switches, model.signs(t, state))
+        select(x == 0, 1, x) if switch.order == 1 else x for switch, x in zip(model.switches, model.signs(t, state))
     )
     return [*out, (f"`{owner}.vector_field`", list(components(model.field(t, y, signs)).items()))]
 
@@ -82,7 +83,7 @@ def _not_finite(system: Any, sol: Solution) -> str | None:
 def _jumping(system: Any, sol: Solution) -> str:
     """Which indicator function jumps within the step that failed."""
     span = abs(float(sol.t1 - sol.t0)) + abs(float(sol.t1))
-    ahead = sol.t1 + 1e-6 * span * jnp.where(sol.t1 >= sol.t0, 1, -1)
+    ahead = sol.t1 + 1e-6 * span * select(sol.t1 >= sol.t0, 1, -1)
     slope = dict(_pieces(system, sol.t1, sol.y1, sol.mode1))[f"`{type(system).__name__}.vector_field`"]
     leaves, tree = jax.tree.flatten(sol.y1)
     if all(jnp.ndim(leaf) == 0 for leaf in leaves):

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 from .._numerics._autodiff import frozen
 from .._numerics._barrier import once
 from .._numerics._lane_cond import compact_cond
+from .._numerics._select import select
 from .._types import Scalar, Y
 from ..system._mode import BEYOND, ModeState
 from ..system._model import SwitchedSystem
@@ -110,7 +111,7 @@ class Flow(eqx.Module):
         """The step once more, to its first event."""
         model = self.model.within(step.state.mode)
         *first, last = once(self.stepper.scaled(model, step.polynomials))
-        polynomials = [*first, jnp.where(model.stacked(touches, False), jnp.minimum(last, 0), last)]
+        polynomials = [*first, select(model.stacked(touches, False), jnp.minimum(last, 0), last)]
         step = step._replace(polynomials=polynomials, noise=model.stacked(step.noise, 0.0))
         return transition(model, self.stepper, self.tolerance, self.record, self.t0, self.seen, step)
 
@@ -118,7 +119,7 @@ class Flow(eqx.Module):
         """A step of the solver, its error against the tolerance, and whether a guard may have a root on it."""
         model, stepper = self.model.within(c.state.mode), self.stepper
 
-        t_next = jnp.where(c.t + c.dt >= self.t1, self.t1, c.t + c.dt)
+        t_next = select(c.t + c.dt >= self.t1, self.t1, c.t + c.dt)
         tick = model.next_tick(c.state.mode) if model.clocks else jnp.inf
         if model.clocks:
             t_next = jnp.minimum(t_next, jnp.maximum(tick, c.t))
@@ -147,20 +148,20 @@ class Flow(eqx.Module):
                 leaps = poor & last & self.leaps(model, c, step)
                 result, keep = RESULTS.where(leaps, RESULTS.jump_in_time, result), keep & ~leaps
             poor = poor & ~last
-            halvings = jnp.where(poor, halvings + 1, jnp.where(keep, 0, halvings))
+            halvings = select(poor, halvings + 1, select(keep, 0, halvings))
             keep = keep & ~poor
-            dt = jnp.where(poor, 0.5 * (t_next - c.t), dt)
+            dt = select(poor, 0.5 * (t_next - c.t), dt)
             # On the last few ulps before the end the polynomials are rounding.
             ahead = t_next - c.t > 4 * eps * jnp.abs(c.t)
             if model.clocks:
                 ahead = ahead | (t_next >= tick)
                 # A step cut short by a tick says nothing against a longer one.
-                dt = jnp.where(keep & (t_next >= tick), jnp.maximum(dt, c.dt), dt)
+                dt = select(keep & (t_next >= tick), jnp.maximum(dt, c.dt), dt)
             touching = ft.reduce(jnp.logical_or, [part for row in touches for part in row])
             busy = c.active & keep & is_finite & ((~quiet & ahead) | touching)
         if self.reverse:
             # The derivatives of a rejected step that overflows are infinite or NaN, and so is zero times that.
-            again = stepper(model, c.state, c.t, jnp.where(keep, t_next, c.t), c.y, c.f)
+            again = stepper(model, c.state, c.t, select(keep, t_next, c.t), c.y, c.f)
             step = step._replace(t_next=again.t_next, y1=again.y1, ks=again.ks, slope=again.slope)
         return _Attempt(step, keep & c.active, dt, halvings, controller, result, busy, touches)
 
@@ -170,7 +171,7 @@ class Flow(eqx.Module):
         is left until a tick is not zero there if a product and a difference are rounded as one.)"""
         length = frozen(step.t_next) - frozen(c.t)
         eps = float(jnp.finfo(length.dtype).eps)
-        far = 4 * eps * jnp.abs(frozen(step.t_next)) / jnp.where(length > 0, length, 1) + 32 * eps
+        far = 4 * eps * jnp.abs(frozen(step.t_next)) / select(length > 0, length, 1) + 32 * eps
 
         def touches(c: list[Scalar], noise: Scalar) -> Bool[Array, ""]:
             value, slope = self.stepper.end(c)
@@ -193,11 +194,11 @@ class Flow(eqx.Module):
         own = self.stepper.pace(self.controller, frozen(step), t, frozen(c.y), self.t1 - self.t0)
         if own is None:
             # An error that is NaN counts as too large.
-            error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), step.error)
+            error = jax.tree.map(lambda e: select(jnp.isnan(e), jnp.inf, e), step.error)
             # The step size is no function to be differentiated; powers of an error of zero are not even differentiable.
             y, y1, error = frozen((c.y, step.y1, error))
             # A step that overflows is too long, but must not make the next one infinity divided by infinity.
-            y1 = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), y1, y)
+            y1 = jax.tree.map(lambda new, old: select(jnp.isfinite(new), new, old), y1, y)
             keep, a, b, _, controller, outcome = self.controller.adapt_step_size(
                 t, t_next, y, y1, None, error, order, c.controller
             )
@@ -265,12 +266,12 @@ class Flow(eqx.Module):
         there = _landed(attempt.busy, self, (here, attempt.touches), end)
         # A lane that looked for a root may have found none.
         event = attempt.busy & there.found
-        near = jnp.where(attempt.busy, there.margin, jnp.inf)
-        there = jax.tree.map(lambda a, b: jnp.where(event, a, b), there, end)._replace(margin=near)
+        near = select(attempt.busy, there.margin, jnp.inf)
+        there = jax.tree.map(lambda a, b: select(event, a, b), there, end)._replace(margin=near)
         roots = list(there.state.roots)
         for k, r in enumerate(roots):
-            later = jnp.where(jnp.abs(r) >= BEYOND, jnp.sign(r) * BEYOND, 0) if model.static(k) else 0
-            roots[k] = jnp.where(event, r, later)
+            later = select(jnp.abs(r) >= BEYOND, jnp.sign(r) * BEYOND, 0) if model.static(k) else 0
+            roots[k] = select(event, r, later)
         return there._replace(state=there.state._replace(roots=tuple(roots)))
 
     def body(self, c: Carry) -> Carry:
@@ -289,7 +290,7 @@ class Flow(eqx.Module):
                 log = log.write(events, news, frozen(row) if self.still else row)
             grazed, forked = grazed | (event & there.grazes), forked | (moved & there.forked)
             events = events + news.astype(jnp.int32)
-            halted = jnp.where(event, jnp.where(there.t > c.t, 0, halted + 1), jnp.where(step.keep, 0, halted))
+            halted = select(event, select(there.t > c.t, 0, halted + 1), select(step.keep, 0, halted))
             result = RESULTS.where(event & (result == RESULTS.successful), there.result, result)
             # Several events at one instant need not be chatter: an impact sets in motion what rested, which lets go of
             # something else. But each switch changes a few times only.
@@ -297,7 +298,7 @@ class Flow(eqx.Module):
         accepted = c.accepted + moved.astype(jnp.int32)
 
         def choose(which: Any, new: Any, old: Any) -> Any:
-            return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
+            return jax.tree.map(lambda a, b: select(which, a, b), new, old)
 
         new = (there.t_after, there.y_after, there.f_after, there.state)
         t, y, f, state = choose(moved, new, (c.t, c.y, c.f, c.state))
@@ -306,7 +307,7 @@ class Flow(eqx.Module):
         if any(k.ends for k in model.switches):
             done = done | (event & there.news & self.ends(there))
         few = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(c.t)
-        crawled = jnp.where(event | (step.step.t_next - c.t > few), 0, c.crawled + 1)
+        crawled = select(event | (step.step.t_next - c.t > few), 0, c.crawled + 1)
         result = RESULTS.where((crawled > 64) & ~done, RESULTS.dt_min_reached, result)
         new = Carry(
             t=t,
@@ -326,14 +327,14 @@ class Flow(eqx.Module):
             swing=largest_so_far(c.swing, c.y),
             grazed=grazed,
             forked=forked,
-            margin=jnp.minimum(c.margin, jnp.where(c.active, there.margin, jnp.inf)),
+            margin=jnp.minimum(c.margin, select(c.active, there.margin, jnp.inf)),
             log=log,
             saved=self.save(c, there, moved, accepted),
             meter=c.meter,
         )
         result = self.verdict(c, new, step, moved, done)
         active = c.active & ~done & (result == RESULTS.successful)
-        meter = self.meter.step(c.meter, jnp.where(active, (t - self.t0) / (self.t1 - self.t0), 1.0))
+        meter = self.meter.step(c.meter, select(active, (t - self.t0) / (self.t1 - self.t0), 1.0))
         return dataclasses.replace(new, active=active, result=result, meter=meter)
 
     def ends(self, there: Transition) -> Bool[Array, ""]:
@@ -387,7 +388,7 @@ def _backward(step: Step, known: list) -> Bool[Array, ""]:
             for r in (2, 3)[: len(c) - 2]:
                 clear = ft.reduce(jnp.maximum, map(jnp.abs, c[r:])) > noise
                 wrong = wrong | ((roots == r) & (c[r] < 0) & clear)
-    return once(jnp.where(wrong, 1.0, 0.0)) > 0
+    return once(select(wrong, 1.0, 0.0)) > 0
 
 
 def finite(tree: Any) -> Bool[Array, ""]:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._barrier import once
+from .._numerics._select import select
 from .._numerics._while_any import while_any
 from .._types import Scalar, Y
 from ..system._model import SwitchedSystem
@@ -55,7 +56,7 @@ def _put(buffer: Any, index: Any, value: Any, when: Any) -> Any:
     """Writes a row; one that is not wanted goes past the end, where it is dropped."""
 
     def put(b: Array, v: Any) -> Array:
-        return b.at[jnp.where(when, index, b.shape[0])].set(v, mode="drop")
+        return b.at[select(when, index, b.shape[0])].set(v, mode="drop")
 
     return jax.tree.map(put, buffer, value)
 
@@ -162,7 +163,7 @@ class Saved(eqx.Module):
         def save(saved: Saved) -> Saved:
             now, t = due(saved), times[jnp.minimum(saved.next, last)]
             length = t1 - t0
-            u = jnp.where(length > 0, (t - t0) / jnp.where(length > 0, length, 1), 1)
+            u = select(length > 0, (t - t0) / select(length > 0, length, 1), 1)
             saved = saved.write(now, t, bernstein(points, u), mode, model)
             return eqx.tree_at(lambda s: s.next, saved, saved.next + now.astype(jnp.int32))
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._compile import interactive
+from .._numerics._select import select
 from .._numerics._tables import frame, lanes_of
 from .._numerics._text import between, components, known, shown, written
 from .._types import Scalar, StateT, Y
@@ -352,7 +353,7 @@ def _evaluated(dense: Any, span: tuple[Scalar, Scalar], t: Array, left: bool) ->
         i = jnp.clip(i, 0, jnp.maximum(steps - 1, 0))
         length = stops[i] - starts[i]
         # (While impacts accumulate no step is under way: the state is the one after them.)
-        u = jnp.where(length > 0, (s - starts[i]) / jnp.where(length > 0, length, 1), 1.0)
+        u = select(length > 0, (s - starts[i]) / select(length > 0, length, 1), 1.0)
         return bernstein(jax.tree.map(lambda p: p[i], points), _clipped(u, 0, 1))
 
     ys = jax.vmap(at)(jnp.ravel(_clipped(t * direction, first, last)))
@@ -360,7 +361,7 @@ def _evaluated(dense: Any, span: tuple[Scalar, Scalar], t: Array, left: bool) ->
     def shaped(y: Array) -> Array:
         y = y.reshape(t.shape + y.shape[1:])
         # A factor makes its derivative NaN too.
-        return y * jnp.where(outside.reshape(t.shape + (1,) * (y.ndim - t.ndim)), jnp.nan, 1)
+        return y * select(outside.reshape(t.shape + (1,) * (y.ndim - t.ndim)), jnp.nan, 1)
 
     return jax.tree.map(shaped, ys)
 

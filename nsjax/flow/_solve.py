@@ -17,6 +17,7 @@ from .._numerics._first_pass import is_first_pass, left_over
 from .._numerics._jaxpr import bends_and_jumps, jumps
 from .._numerics._linalg import WRITTEN_OUT
 from .._numerics._merge import merged
+from .._numerics._select import select
 from .._numerics._text import known, suggesting
 from .._numerics._while_any import while_any
 from .._numerics._whole_loops import ask_for_whole_loops
@@ -76,7 +77,7 @@ def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> tu
 
 
 def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> tuple[Solution, Any]:
-    direction = jnp.where(t1 >= t0, 1, -1).astype(t0.dtype)
+    direction = select(t1 >= t0, 1, -1).astype(t0.dtype)
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
     model = SwitchedSystem(system.assembled(), direction, start, y0).at(start)
@@ -211,8 +212,8 @@ def _solution(flow: Flow, c: Carry, t0: Scalar, first: ModeState, end_wanted: bo
     model, stop = flow.model, flow.t1
     # After an event at the very end the solution has no time left, but it moves with the difference of the two times.
     ended = c.t == stop
-    late = jnp.where(ended, stop - c.t, 0)
-    y1, t_end = jax.tree.map(lambda y, f: y + jnp.where(ended, f, 0) * late, c.y, c.f), c.t + late
+    late = select(ended, stop - c.t, 0)
+    y1, t_end = jax.tree.map(lambda y, f: y + select(ended, f, 0) * late, c.y, c.f), c.t + late
     saved = c.saved
     if end_wanted:
         saved = saved.write(True, t_end, y1, c.state.mode, model)
@@ -259,7 +260,7 @@ def _tied(carry: Carry, args: Any) -> Carry:
     start, and need not be found out by transforming the body once more for every level at which it spreads."""
     never = jnp.zeros((), bool)
     leaves = jax.tree.leaves(eqx.filter(args, eqx.is_inexact_array))
-    nought = sum(jnp.sum(jnp.where(never, jnp.real(x), 0)).astype(carry.t.dtype) for x in leaves)
+    nought = sum(jnp.sum(select(never, jnp.real(x), 0)).astype(carry.t.dtype) for x in leaves)
 
     def tie(x: Any) -> Any:
         if not eqx.is_array(x):
@@ -283,7 +284,7 @@ def _events(model: SwitchedSystem, c: Carry, start: ModeState) -> Events:
     first = _row(start.mode)[None] if model.switches else jnp.zeros((1, 0), jnp.int32)
     # The mode before an event is the one after the last; rows past the end keep their padding.
     before = jnp.concatenate([first, log.modes])[: len(log.t)]
-    before = jnp.where(log.slot[:, None] < 0, log.modes, before)
+    before = select(log.slot[:, None] < 0, log.modes, before)
     return Events(
         t=log.t,
         switch=table[log.slot],

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
+from .._numerics._select import select
 from .._types import Number, Scalar
 from ..system._sgn import sgn
 from ..system._system import SwitchValues, System
@@ -292,7 +293,7 @@ class DiscontinuousHopf(System):
         square = y.x1**2 + y.x2**2
         # At the origin r / r is told apart from μ / r, whose factor s.plus + s.minus vanishes there.
         away = square > 0
-        per_r = jnp.where(away, 1 / jnp.sqrt(jnp.where(away, square, 1)), 0)
+        per_r = select(away, 1 / jnp.sqrt(select(away, square, 1)), 0)
         growth = -1 + s.plus - s.minus + self.mu / 2 * (s.plus + s.minus) * per_r
         return Plane(growth * y.x1 - self.omega * y.x2, self.omega * y.x1 + growth * y.x2)
 

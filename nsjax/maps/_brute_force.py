@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._numerics._progress import ProgressMeter, QUIET
+from .._numerics._select import select
 from .._numerics._tables import frame
 from .._numerics._text import between, components, positive, shown, written
 from .._types import Scalar, Y
@@ -123,7 +124,7 @@ class _Carried(_Lane):
             last, result = jax.tree.map(lambda x: x[-1], (found.y, found.result))
             # Where the solution fails, the next value begins anew.
             lost = ~jnp.isfinite(ravel(last)).all()
-            return jax.tree.map(lambda a, b: jnp.where(lost, a, b), first, last), (found.t, found.y, result)
+            return jax.tree.map(lambda a, b: select(lost, a, b), first, last), (found.t, found.y, result)
 
         return lax.scan(at, first, self.values)[1]
 

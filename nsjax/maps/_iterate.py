@@ -12,6 +12,7 @@ from jaxtyping import Array, Int
 
 from .._numerics._autodiff import frozen
 from .._numerics._compile import interactive
+from .._numerics._select import select
 from .._numerics._text import between, listed, positive, shown, written
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start
@@ -142,7 +143,7 @@ class PoincareMap(eqx.Module):
             later, y, mode, now = self.once(system, t, start.t0, y, start.given(system, mode))
             # What has failed stays failed; it goes on from NaN, which takes no step.
             result = RESULTS.where(is_okay(result) & (now != RESULTS.successful), now, result)
-            return jnp.where(is_okay(result), later, t), unless_failed(result, y), mode, result
+            return select(is_okay(result), later, t), unless_failed(result, y), mode, result
 
         return (start.t, start.y, start.mode, start.result), step
 
@@ -182,4 +183,4 @@ def iterated(
 
 def unless_failed(result: RESULTS, tree: Any) -> Any:
     """`tree`, or NaN, derivatives included."""
-    return jax.tree.map(lambda x: x * jnp.where(is_okay(result), 1, jnp.nan).astype(x.dtype), tree)
+    return jax.tree.map(lambda x: x * select(is_okay(result), 1, jnp.nan).astype(x.dtype), tree)

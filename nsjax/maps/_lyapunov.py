@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._numerics._compile import interactive
+from .._numerics._select import select
 from .._numerics._text import listed, positive, shown
 from .._types import Scalar, Y
 from ..derivatives._saltation import saltation_matrices
@@ -133,7 +134,7 @@ def _growth_of_volume(system: System, sol: Solution, t0: Scalar, y0: Y, integrat
         return total
     happened = jnp.arange(events.t.size, dtype=events.num.dtype) < events.num
     jumps = jnp.linalg.slogdet(saltation_matrices(system, events))[1]
-    return total + jnp.sum(jnp.where(happened, jumps, 0))
+    return total + jnp.sum(select(happened, jumps, 0))
 
 
 def _orthogonalised(w: Array) -> tuple[Array, Array]:
@@ -142,7 +143,7 @@ def _orthogonalised(w: Array) -> tuple[Array, Array]:
     size = jnp.abs(jnp.diagonal(r))
     rounding = 32 * len(w) * jnp.finfo(w.dtype).eps * jnp.linalg.norm(w)
     nothing = size <= rounding
-    return q, jnp.where(nothing, -jnp.inf, jnp.log(jnp.where(nothing, 1, size)))
+    return q, select(nothing, -jnp.inf, jnp.log(select(nothing, 1, size)))
 
 
 @interactive
@@ -174,7 +175,7 @@ def _follow(
         x1, w, sol = along(q)
         # What has failed stays failed; it goes on from NaN, which takes no step.
         result = RESULTS.where(is_okay(result) & ~is_okay(sol.result), sol.result, result)
-        lost = jnp.where(is_okay(result), 0, jnp.nan).astype(x.dtype)
+        lost = select(is_okay(result), 0, jnp.nan).astype(x.dtype)
         q, logs = _orthogonalised(w)
         grown = _growth_of_volume(system, sol, a, unravel(x), step.integrator) if volume else None
         return (x1 + lost, sol.mode1, result, q), (logs + lost, grown)
@@ -202,7 +203,7 @@ def standard_errors(rates: Float[Array, "span exponents"]) -> Float[Array, " exp
         found.append(jnp.std(means, axis=0, ddof=1) / blocks**0.5)
         length *= 2
     error = jnp.max(jnp.stack(found[-3:]), axis=0)
-    return jnp.where(jnp.isfinite(jnp.mean(rates, axis=0)), error, jnp.nan)
+    return select(jnp.isfinite(jnp.mean(rates, axis=0)), error, jnp.nan)
 
 
 def lyapunov_spectrum(

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._progress import Counting
+from .._numerics._select import select
 from .._types import Scalar, Y
 from ..flow._results import is_okay, RESULTS
 from ..flow._solution import Events
@@ -71,7 +72,7 @@ class Window(eqx.Module):
             system = put_parameter(system, path, value)
         unravel = jfu.ravel_pytree(self.like)[1]
         begin = self.step.start(system, self.t0, unravel(here.x), {})
-        mode = jnp.where(here.new, begin.mode, here.mode)
+        mode = select(here.new, begin.mode, here.mode)
         result = RESULTS.where(here.new, begin.result, RESULTS.successful)
         watched = self.step.flow_of(system)
 
@@ -86,7 +87,7 @@ class Window(eqx.Module):
             x1, w1, (later, new, mode1, events) = jax.jvp(flow, (x,), (w,), has_aux=True)
             # What has failed stays failed; it goes on from NaN, which takes no step.
             result = RESULTS.where(is_okay(result) & ~is_okay(new), new, result)
-            x1 = x1 + jnp.where(is_okay(result), 0, jnp.nan).astype(x.dtype)
+            x1 = x1 + select(is_okay(result), 0, jnp.nan).astype(x.dtype)
             w1, grown = _scaled(w1)
             log, number = _logged(system, events, log, total)
             return (later, x1, mode1, w1, result, log, total + number), (x1, grown, later - t, number)
@@ -97,15 +98,15 @@ class Window(eqx.Module):
         carry, (points, grown, times, numbers) = lax.scan(turn, carry, None, length=self.iterates)
         t, x, mode, w, result, log, total = carry
         # An orbit that repels may be followed for a while too, by a start that lies on it.
-        period = jnp.where(jnp.sum(grown[-self.iterates // 2 :]) > GROWN, 0, settled(points, self.tol))
+        period = select(jnp.sum(grown[-self.iterates // 2 :]) > GROWN, 0, settled(points, self.tol))
         ago = jnp.arange(self.iterates - 1, -1, -1, dtype=period.dtype)
         last, half = ago < period, self.iterates // 2
         around = ago < half - half % jnp.maximum(period, 1)
-        rate = jnp.sum(jnp.where(around, grown, 0)) / jnp.sum(jnp.where(around, times, 0))
-        count = jnp.sum(jnp.where(last, numbers, 0)).astype(jnp.int32)
+        rate = jnp.sum(select(around, grown, 0)) / jnp.sum(select(around, times, 0))
+        count = jnp.sum(select(last, numbers, 0)).astype(jnp.int32)
         log = jnp.roll(log, jnp.minimum(count, KEPT) - total, axis=0)
         nothing = jnp.concatenate([jnp.full((1,), -1, jnp.int8), mode_row(system, mode)])
-        log = jnp.where(count > 0, log, log.at[0].set(nothing))
+        log = select(count > 0, log, log.at[0].set(nothing))
 
         def by_part(x: Array) -> Array:
             return jnp.sum(x.reshape(PARTS, -1), axis=1)
@@ -125,8 +126,8 @@ def _scaled(w: Array) -> tuple[Array, Scalar]:
     the system has forgotten it: minus infinity, and another one sets out."""
     size = jnp.linalg.norm(w)
     forgotten = size <= 32 * len(w) * jnp.finfo(w.dtype).eps
-    grown = jnp.where(forgotten, -jnp.inf, jnp.log(jnp.where(forgotten, 1, size)))
-    return jnp.where(forgotten, jnp.asarray(direction_of(len(w)), w.dtype), w / jnp.where(forgotten, 1, size)), grown
+    grown = select(forgotten, -jnp.inf, jnp.log(select(forgotten, 1, size)))
+    return select(forgotten, jnp.asarray(direction_of(len(w)), w.dtype), w / select(forgotten, 1, size)), grown
 
 
 def _logged(system: System, events: Events, log: Array, total: Array) -> tuple[Array, Array]:
@@ -138,7 +139,7 @@ def _logged(system: System, events: Events, log: Array, total: Array) -> tuple[A
         log, number = now
         row = jnp.concatenate([events.switch[i][None].astype(jnp.int8), mode_row(system, events.mode_after[i])])
         own = events.switch[i] < len(system.switches)
-        log = jnp.where(own & (rows == (total + number) % KEPT), row, log)
+        log = select(own & (rows == (total + number) % KEPT), row, log)
         return log, number + own.astype(number.dtype)
 
     if not (system.switches and events.t.size):

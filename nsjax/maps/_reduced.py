@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from .._numerics._compile import interactive
 from .._numerics._root import find_root, Newton
+from .._numerics._select import select
 from .._numerics._text import between, shown, written
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start
@@ -150,7 +151,7 @@ def _reduced(
         end = t0 + jnp.asarray(system.period, t0.dtype) * span.order
         sol = integrate(system, t0, end, state(others, x), span.integrator, mode=span.mode)
         # Newton's method must not be led by a solution that ended early.
-        return jnp.where(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0], jnp.nan), sol.result
+        return select(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0], jnp.nan), sol.result
 
     def residual(others: Array, parameters: tuple) -> Array:
         return jnp.delete(advance(others, parameters)[0], place, assume_unique_indices=True) - others

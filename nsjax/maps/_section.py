@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._numerics._autodiff import frozen
+from .._numerics._select import select
 from .._numerics._text import positive
 from .._types import Scalar, Y
 from ..flow._integrator import Integrator
@@ -102,7 +103,7 @@ class _Section(PoincareMap):
         h, rate = model.h(k, t, y)[0], model.approach(k, t, y, state)
         at_once = AT_ONCE * float(jnp.finfo(t.dtype).eps) ** 0.5 * self.max_time
         on = (jnp.abs(h) <= at_once * jnp.abs(rate)) & (rate != 0)
-        return *others, jnp.where(on, jnp.sign(rate).astype(jnp.int32), side)
+        return *others, select(on, jnp.sign(rate).astype(jnp.int32), side)
 
     def passage(
         self, system: System, here: tuple[Scalar, Scalar, Y], mode: Any, still: bool = False
@@ -131,8 +132,8 @@ def _onto(switch: AbstractSwitch, system: System, sol: Solution, y: Y) -> Y:
 
     h, normal = jax.value_and_grad(gap)(x)
     rounding = float(jnp.finfo(x.dtype).eps) ** 0.5 * jnp.max(jnp.abs(x)) * jnp.linalg.norm(normal)
-    h = jnp.where(jnp.abs(h) <= 2 * jnp.abs(gap(before)) + rounding, h, 0)
-    return unravel(flat - h * normal / jnp.where(normal @ normal == 0, 1, normal @ normal))
+    h = select(jnp.abs(h) <= 2 * jnp.abs(gap(before)) + rounding, h, 0)
+    return unravel(flat - h * normal / select(normal @ normal == 0, 1, normal @ normal))
 
 
 def section_map(

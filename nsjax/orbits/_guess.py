@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from .._numerics._compile import interactive
+from .._numerics._select import select
 from .._types import Scalar, Y
 from ..derivatives._flow_map import with_room
 from ..derivatives._variational import arcs
@@ -52,17 +53,17 @@ def base_on(sol: Solution, t0: Scalar, y0: Y, period: Scalar, sign: float) -> tu
     slides = jnp.stack(
         [modes[:, k] == 0 for k, s in enumerate(system.switches) if isinstance(s, sgn)] or [jnp.zeros(len(begin), bool)]
     ).any(0)
-    longest = jnp.argmax((end - begin) * jnp.where(slides, 1e-6, 1.0))
+    longest = jnp.argmax((end - begin) * select(slides, 1e-6, 1.0))
     base = t0 + sign * 0.5 * (begin[longest] + end[longest])
     here = sol.evaluate(base)
     share = jnp.linspace(0.5, 1.5, 401, dtype=base.dtype)
     later = jax.vmap(lambda u: ravel(sol.evaluate(base + sign * u * period)))(share)
     extent = jnp.max(later, axis=0) - jnp.min(later, axis=0)
-    gap = distance(later / jnp.where(extent == 0, 1, extent), ravel(here) / jnp.where(extent == 0, 1, extent))
+    gap = distance(later / select(extent == 0, 1, extent), ravel(here) / select(extent == 0, 1, extent))
     # Of equally near returns the one nearest to the guess: a user who asks for two laps gets two.
     best = share[jnp.argmin(gap + 0.05 * jnp.abs(share - 1))]
     reached = is_okay(sol.result)
-    return here, jnp.where(reached, best, 1) * period, of_relays(system, modes[longest])
+    return here, select(reached, best, 1) * period, of_relays(system, modes[longest])
 
 
 def of_relays(system: System, mode: Any) -> Relays:
@@ -93,7 +94,7 @@ def at_start(model: SwitchedSystem, t: Scalar, y: Y, given: Relays = None) -> An
         if isinstance(switch, sgn):
             h = model.least(k, t, y)
             noise = jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y))
-            zero = jnp.where(jnp.abs(h) <= 1e3 * noise, 0, jnp.sign(h)).astype(jnp.int32)
+            zero = select(jnp.abs(h) <= 1e3 * noise, 0, jnp.sign(h)).astype(jnp.int32)
         elif isinstance(switch, relay):
             before = jnp.asarray((given or {}).get(switch.name, zero), jnp.int32)
             zero = switch.mode_at(model.system, t, y, before)

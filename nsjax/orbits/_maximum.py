@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from .._numerics._autodiff import frozen
 from .._numerics._minima import NODES
+from .._numerics._select import select
 from .._types import Scalar, Y
 from ..flow._integrator import Integrator
 from ..system._system import System
@@ -60,10 +61,10 @@ def largest(system: System, arcs: Arcs, integrator: Integrator, fn: Callable[[Sc
     _, length = ends(calm)
     for _ in range(REFINEMENTS):
         _, slope, bend = at(still, points, calm, share)
-        move = jnp.where(bend < 0, -slope / jnp.where(bend < 0, bend, 1), 0) / jnp.where(length > 0, length, 1)
+        move = select(bend < 0, -slope / select(bend < 0, bend, 1), 0) / select(length > 0, length, 1)
         # The polynomials gave its place to within a node.
         share = jnp.clip(share + jnp.clip(move, -1 / NODES, 1 / NODES), 0, 1)
     value, slope, bend = at(flows, x, arcs, frozen(share))
     inside = (share > 0) & (share < 1) & (bend < 0)
     # The place moves with the parameters, which matters from the second derivative on.
-    return value - jnp.where(inside, 0.5 * slope**2 / jnp.where(inside, bend, 1), 0)
+    return value - select(inside, 0.5 * slope**2 / select(inside, bend, 1), 0)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool
 from .._numerics._autodiff import frozen
 from .._numerics._compile import interactive
 from .._numerics._root import Newton
+from .._numerics._select import select
 from .._types import Scalar, Y
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
@@ -108,7 +109,7 @@ class Search(NamedTuple):
         """Of an autonomous system, without a guess of the period."""
         start, period, rests, mode = self._settled(system, y0)
         lost = ~(period > 0)
-        orbit = self._tries(system, start, jnp.where(lost, 1, period), 1, mode)
+        orbit = self._tries(system, start, select(lost, 1, period), 1, mode)
         at_rest = self._at_rest(system, start) if self.concrete else RESULTS.orbit_is_equilibrium
         end = RESULTS.where(rests, at_rest, RESULTS.orbit_not_found)
         return eqx.tree_at(lambda o: o.result, orbit, RESULTS.where(lost, end, orbit.result))

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from .._numerics._compile import interactive
+from .._numerics._select import select
 from .._types import Scalar, Y
 from ..derivatives._flow_map import Directions, flow_map, with_room
 from ..derivatives._variational import arcs
@@ -98,18 +99,18 @@ def _returned(system: System, last: Solution, loop: Solution, t0: Scalar, sign: 
     u = jnp.asarray(np.arange(8) / 8, starts.dtype)
     times = sign * (starts[:, None] + (stops - starts)[:, None] * u).ravel()
     valid = jnp.repeat(jnp.arange(len(starts), dtype=steps.dtype) < steps, 8)
-    states = jax.vmap(lambda t: ravel(loop.evaluate(t)))(jnp.where(valid, times, t0))
+    states = jax.vmap(lambda t: ravel(loop.evaluate(t)))(select(valid, times, t0))
     here = ravel(last.y1)
-    scale = jnp.max(jnp.where(valid[:, None], jnp.abs(states - here), 0), axis=0)
-    gap = jnp.max(jnp.abs(states - here) / jnp.where(scale == 0, 1, scale), axis=-1)
-    gap = jnp.where(valid, gap, jnp.inf)
+    scale = jnp.max(select(valid[:, None], jnp.abs(states - here), 0), axis=0)
+    gap = jnp.max(jnp.abs(states - here) / select(scale == 0, 1, scale), axis=-1)
+    gap = select(valid, gap, jnp.inf)
     # The first local minimum of the distance that is small, once the solution has been far away.
     far = jnp.cumsum(gap > 0.3) > 0
     near = far & (gap < 0.1)
     low = near & (gap <= jnp.roll(gap, 1)) & (gap <= jnp.roll(gap, -1))
     ended = (last.result == RESULTS.max_steps_reached) | (last.result == RESULTS.successful)
     rests = ended & (jnp.max(scale) <= 1e-4 * (1 + jnp.max(jnp.abs(here))))
-    period = jnp.where(rests, 0, sign * (times[jnp.argmax(low)] - t0))
+    period = select(rests, 0, sign * (times[jnp.argmax(low)] - t0))
     return Settled(last.y1, period, rests, of_relays(system, last.mode1))
 
 
@@ -167,8 +168,8 @@ def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
             for i in range(model.parts[k]):
                 # In the direction off the surface the field says nothing: there the matrix is made regular.
                 n = jax.grad(lambda x, k=k, i=i: model.h(k, t0, unravel(x))[i])(x)
-                n = n / jnp.where(jnp.any(n != 0), jnp.linalg.norm(n), 1)
-                matrix = matrix + jnp.where(held, size, 0) * jnp.outer(n, n)
+                n = n / select(jnp.any(n != 0), jnp.linalg.norm(n), 1)
+                matrix = matrix + select(held, size, 0) * jnp.outer(n, n)
     values = jnp.linalg.svd(matrix, compute_uv=False)
     return sticks & (values[-1] <= 1e-9 * values[0])
 
@@ -177,7 +178,5 @@ def held_throughout(system: System, begin: Array, end: Array, modes: Array) -> B
     """Whether friction holds a solution along all of its arcs. (At the edge of the continuum it lets go for a time
     of the size of the root of rounding.)"""
     length = jnp.maximum(end - begin, 0)
-    free = [
-        jnp.sum(jnp.where(modes[:, i] == 0, 0, length)) for i, k in enumerate(system.switches) if isinstance(k, sgn)
-    ]
+    free = [jnp.sum(select(modes[:, i] == 0, 0, length)) for i, k in enumerate(system.switches) if isinstance(k, sgn)]
     return jnp.any(jnp.asarray(free, length.dtype) <= 1e-3 * jnp.sum(length))

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool
 from .._numerics._autodiff import frozen
 from .._numerics._compile import interactive
 from .._numerics._root import find_root, Newton
+from .._numerics._select import select
 from .._types import Scalar, Y
 from ..derivatives._floquet import floquet, forwards, structural_zeros
 from ..derivatives._flow_map import Directions, flow_map, with_room
@@ -88,7 +89,7 @@ class _Section(NamedTuple):
 
     def height(self, x: Array) -> Scalar:
         speed = self.normal @ self.normal
-        return self.normal @ (x - self.guess) / jnp.where(speed == 0, 1, speed)
+        return self.normal @ (x - self.guess) / select(speed == 0, 1, speed)
 
     def at_rest(self, x: Array, field: Array) -> Bool[Array, ""]:
         """Whether the search was in an equilibrium, or ended in one: near it Newton's Jacobian is singular, and it
@@ -220,7 +221,7 @@ def _tried(
 
 def _reached(sol: Solution) -> Array:
     """The state at the end. A solution that ended early is no solution: Newton's method must not be led by it."""
-    return jnp.where(is_okay(sol.result), ravel(sol.y1), jnp.nan)
+    return select(is_okay(sol.result), ravel(sol.y1), jnp.nan)
 
 
 def _described(
@@ -284,7 +285,7 @@ def _reversed(arcs: Arcs, events: Events, y0: Y, period: Scalar) -> tuple[Arcs, 
     def back(leaf: Array, count: Array) -> Array:
         """The first `count` rows in reverse."""
         index = jnp.arange(len(leaf), dtype=count.dtype)
-        return leaf[jnp.where(index < count, count - 1 - index, index)]
+        return leaf[select(index < count, count - 1 - index, index)]
 
     def log(leaf: Array) -> Array:
         return back(leaf, num)
@@ -302,12 +303,12 @@ def _reversed(arcs: Arcs, events: Events, y0: Y, period: Scalar) -> tuple[Arcs, 
 
     def starts(first: Array, later: Array) -> Array:
         held = happened.reshape((-1,) + (1,) * (later.ndim - 1))
-        return jnp.concatenate([first[None], jnp.where(held, later, first)])[:, None]
+        return jnp.concatenate([first[None], select(held, later, first)])[:, None]
 
     used = jnp.arange(rows, dtype=num.dtype) <= num
 
     def times(t: Array) -> Array:
-        return jnp.where(used, back(t, num + 1) + period, t + 2 * period)  # the others stay at the end
+        return select(used, back(t, num + 1) + period, t + 2 * period)  # the others stay at the end
 
     mode = back(arcs.mode, num + 1)
     return Arcs(times(arcs.end), times(arcs.begin), mode, jax.tree.map(starts, y0, y_after)), turned

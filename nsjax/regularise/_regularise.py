@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._autodiff import frozen
 from .._numerics._jaxpr import is_constant
+from .._numerics._select import select
 from .._numerics._series import Series
 from .._types import Scalar, Y
 from ..system._checks import check_model, check_system
@@ -149,7 +150,7 @@ def _quotient(
 
     gradient = jax.jacfwd(along)([x[i] for i in moving]) if moving else []
     square = sum([jnp.sum(g**2) for g in gradient], jnp.zeros((), x[0].dtype))
-    ahead = {i: g / jnp.where(square > 0, square, 1) for i, g in zip(moving, gradient)}
+    ahead = {i: g / select(square > 0, square, 1) for i, g in zip(moving, gradient)}
 
     def course(rate: Any) -> list[Any]:
         return [rate * ahead[i] if i in ahead else None for i in range(len(x))]
@@ -180,8 +181,8 @@ def _quotient(
         known = (lost <= eps * jnp.abs(near)) & (gap <= rounding) & (square > 0)
         jump = (gap > rounding + 1e3 * lost * jnp.abs(height)) & (jnp.abs(height) <= width)
         jump |= (height == 0) & ~known
-        off = value / jnp.where(known, 1, height)
-        return jnp.where(known, total(rates, jnp.where(known, height, 0)), off), jnp.any(jump)
+        off = value / select(known, 1, height)
+        return select(known, total(rates, select(known, height, 0)), off), jnp.any(jump)
 
     out, jumps = zip(*[check(*entry) for entry in zip(tops, sizes, map(list, zip(*terms)))])
     return list(out), ft.reduce(jnp.logical_or, jumps)
@@ -225,7 +226,7 @@ def _banded_mode(model: SwitchedSystem, eta: Any, t: Scalar, y: Y) -> ModeState:
     model, eta, t, y = frozen((model, eta, t, y))  # modes have no derivative
     heights = [jnp.stack(model.h(k, t, y)) for k in range(len(model.switches))]
     part = tuple(jnp.argmin(h).astype(jnp.int32) if h.size > 1 else None for h in heights)
-    side = jnp.stack([jnp.where(jnp.min(h) >= 0, 1, -1) for h in heights]).astype(jnp.int32)
+    side = jnp.stack([select(jnp.min(h) >= 0, 1, -1) for h in heights]).astype(jnp.int32)
     which = model.holdable
 
     def state(mode: Int[Array, " switches"]) -> ModeState:
@@ -235,21 +236,21 @@ def _banded_mode(model: SwitchedSystem, eta: Any, t: Scalar, y: Y) -> ModeState:
         return state(side)
     inside = jnp.stack([jnp.abs(jnp.min(heights[k])) <= eta for k in which])
     at = jnp.asarray(which)
-    mode = side.at[at].set(jnp.where(inside, 0, side[at]))
+    mode = side.at[at].set(select(inside, 0, side[at]))
     # A surface that repels is crossed.
     _, slope = model.linear(t, y, state(mode), tuple(mode.astype(t.dtype)))
-    mode = side.at[at].set(jnp.where(inside & (jnp.diag(slope) < 0), 0, side[at]))
+    mode = side.at[at].set(select(inside & (jnp.diag(slope) < 0), 0, side[at]))
 
     def release(carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Bool[Array, ""]]:
         """Lets go the one that violates its bound most, to the side to which dh/dt = slope (s - λ) then points."""
         count, mode, _ = carry
         lam = jnp.stack([model.values(t, y, state(mode))[k] for k in which])
         bound = jnp.stack([jnp.asarray(model.bound(k), t.dtype) for k in which])
-        excess = jnp.where(mode[at] == 0, jnp.abs(lam) / bound - 1, -1)
-        excess = jnp.where(jnp.isnan(excess), jnp.inf, excess)
+        excess = select(mode[at] == 0, jnp.abs(lam) / bound - 1, -1)
+        excess = select(jnp.isnan(excess), jnp.inf, excess)
         worst = jnp.argmax(excess)
         over = excess[worst] > 0
-        free = jnp.where(over, jnp.where(lam[worst] >= 0, 1, -1), mode[at[worst]])
+        free = select(over, select(lam[worst] >= 0, 1, -1), mode[at[worst]])
         return count + 1, mode.at[at[worst]].set(free.astype(jnp.int32)), over
 
     carry = (jnp.zeros((), jnp.int32), mode, jnp.ones((), bool))

@@ -11,6 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from .._numerics._jaxpr import is_constant
+from .._numerics._select import select
 from .._numerics._text import did_you_mean
 from .._types import Scalar, Y
 from ._clock import clock
@@ -160,6 +161,6 @@ def closing_contacts(model: SwitchedSystem, t: Scalar, y: Y) -> dict[int, Bool[A
     free = ModeState.of((), (None,) * len(zeros))
     found = {}
     for k in model.contacts:
-        unit = tuple(jnp.where(i == k, 1, zero) for i, zero in enumerate(zeros))
+        unit = tuple(select(i == k, 1, zero) for i, zero in enumerate(zeros))
         found[k] = model.rates((k,), t, y, free, unit)[0] < model.rates((k,), t, y, free, zeros)[0]
     return found

@@ -6,6 +6,7 @@ from typing import Any, Self, TYPE_CHECKING
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from .._numerics._select import select
 from .._types import Guard, Scalar, Y
 from ._mode import ModeState, Slot
 from ._switch import AbstractSwitch
@@ -61,7 +62,7 @@ class clock(AbstractSwitch):
         return ()
 
     def next_mode(self, mode: Int[Array, ""], direction: Any) -> Int[Array, ""]:
-        return mode + jnp.where(direction > 0, 1, -1)
+        return mode + select(direction > 0, 1, -1)
 
     def surface(self, model: "SwitchedSystem", k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
         return model.span(k, state.mode)[1] - t
@@ -69,8 +70,8 @@ class clock(AbstractSwitch):
     def guard_row(self, model: "SwitchedSystem", slot: Slot, t: Scalar, y: Y, state: ModeState) -> list[Scalar]:
         low, high = model.span(slot.switch, state.mode)
         ahead = model.direction > 0
-        left = jnp.where(ahead, high - t * model.direction, t * model.direction - low)
-        return [jnp.where(jnp.isfinite(jnp.where(ahead, high, low)), left, jnp.ones((), t.dtype))]
+        left = select(ahead, high - t * model.direction, t * model.direction - low)
+        return [select(jnp.isfinite(select(ahead, high, low)), left, jnp.ones((), t.dtype))]
 
     def _times(self, system: "System", like: Scalar) -> tuple[Array, Scalar]:
         start = 0.0 if self.offset_fn is None else self.offset_fn(system)
@@ -94,7 +95,7 @@ class clock(AbstractSwitch):
     def count(self, system: "System", t: Scalar, forwards: Any) -> Int[Array, ""]:
         """How many ticks have passed at time `t`; at a tick those after it, or before it if time runs backwards."""
         times, start = self._times(system, t)
-        blur = 8 * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + jnp.abs(start)) * jnp.where(forwards, 1, -1)
+        blur = 8 * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + jnp.abs(start)) * select(forwards, 1, -1)
         if times.ndim == 0:
             return jnp.floor((t - start + blur) / times).astype(jnp.int32)
         return jnp.searchsorted(start + times, t + blur, side="right").astype(jnp.int32)

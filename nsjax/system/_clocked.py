@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from .._numerics._autodiff import frozen
+from .._numerics._select import select
 from .._types import Mode, Scalar
 from ._clock import clock
 from ._mode import ModeState
@@ -80,7 +81,7 @@ class Clocked(eqx.Module):
     def tick(self, k: int, mode: Mode) -> Scalar:
         """When time, increasing as the flow sees it, meets the next tick of clock k."""
         low, high = self.span(k, mode)
-        return jnp.where(self.direction > 0, high, -low)
+        return select(self.direction > 0, high, -low)
 
     def next_tick(self, mode: Mode) -> Scalar:
         """The same of the clock that ticks first."""
@@ -97,13 +98,13 @@ class Clocked(eqx.Module):
         if self.window is None:
             return t
         (low, high), margin = self.window, self.margin(t)
-        shift = jnp.where(t < low + margin, 2 * margin, 0) - jnp.where(t > high - margin, 2 * margin, 0)
-        kept = jnp.where(t < low - margin, low + margin, t + shift)
-        return jnp.where(t > high + margin, high - margin, kept)
+        shift = select(t < low + margin, 2 * margin, 0) - select(t > high - margin, 2 * margin, 0)
+        kept = select(t < low - margin, low + margin, t + shift)
+        return select(t > high + margin, high - margin, kept)
 
     def margin(self, t: Scalar) -> Scalar:
         """How near to a tick time is within rounding of it; there it is shifted by twice as much."""
         assert self.window is not None
         ends = (*self.window, frozen(t))
-        size = ft.reduce(jnp.maximum, [jnp.where(jnp.isfinite(x), jnp.abs(x), 0) for x in ends])
+        size = ft.reduce(jnp.maximum, [select(jnp.isfinite(x), jnp.abs(x), 0) for x in ends])
         return 100 * float(jnp.finfo(t.dtype).eps) * size + float(jnp.finfo(t.dtype).tiny) ** 0.75

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._numerics._linalg import coloured, Row, WRITTEN_OUT
+from .._numerics._select import select
 
 
 Block = tuple[int, ...]
@@ -73,13 +74,13 @@ class Coupling(NamedTuple):
         else:
             found = taken(slope[i], colour)
         # Of a colour only one value acts on a surface, and the others of a block need not.
-        return found if np.all(there) else jnp.where(there, found, 0)
+        return found if np.all(there) else select(there, found, 0)
 
     def matrix(self, slope: list[Any]) -> Float[Array, "m m"]:
         """With all of its zeros."""
         if len(slope) <= WRITTEN_OUT:
             return jnp.stack([jnp.stack(entries) for entries in slope])
-        return jnp.where(np.array(self.touches), taken(jnp.stack(slope, axis=1), self.colour).T, 0)
+        return select(np.array(self.touches), taken(jnp.stack(slope, axis=1), self.colour).T, 0)
 
     def joined(self, parts: list[Any]) -> Row:
         """One row of the results for the members of the blocks of each group: `[group][member]`."""

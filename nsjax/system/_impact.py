@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .._numerics._jaxpr import is_constant
+from .._numerics._select import select
 from .._types import Guard, Scalar, Y
 from ._mode import ModeState, Slot
 from ._switch import AbstractSwitch
@@ -79,7 +80,7 @@ class impact(AbstractSwitch):
     def guard_row(self, model: "SwitchedSystem", slot: Slot, t: Scalar, y: Y, state: ModeState) -> list[Scalar]:
         k = slot.switch
         gap = model.h(k, t, y)[slot.part]
-        return [jnp.where(state.mode[k] == 1, jnp.ones((), t.dtype), gap) if k in model.contacts else gap]
+        return [select(state.mode[k] == 1, jnp.ones((), t.dtype), gap) if k in model.contacts else gap]
 
     def bound_guard(self, model: "SwitchedSystem", slot: Slot, value: Scalar, state: ModeState) -> Scalar:
         return value

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from .._numerics._select import select
 from .._types import Mode
 
 
@@ -40,7 +41,7 @@ def pick(values: tuple[Any, ...], index: Any) -> Any:
     """One of several, by an index that may be traced, or None if there is only one."""
     found = values[0]
     for i, value in enumerate(values[1:], 1):
-        found = jnp.where(index == i, value, found)
+        found = select(index == i, value, found)
     return found
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._autodiff import frozen
 from .._numerics._jaxpr import dependence, is_affine, is_constant
+from .._numerics._select import select
 from .._types import Mode, Scalar, Y
 from ._clocked import Clocked
 from ._coupling import Coupling
@@ -160,7 +161,7 @@ class SwitchedSystem(Clocked):
     def least(self, k: int, t: Scalar, y: Y) -> Scalar:
         """h of switch k, the least of its components. By comparisons, as XLA may work a component out twice, rounded
         otherwise: `jnp.min` would find its minimum nowhere then, and have no derivative."""
-        return ft.reduce(lambda a, b: jnp.where(b < a, b, a), self.h(k, t, y))
+        return ft.reduce(lambda a, b: select(b < a, b, a), self.h(k, t, y))
 
     def bound(self, k: int) -> Any:
         return self.switches[k].bound(self.system)
@@ -176,9 +177,9 @@ class SwitchedSystem(Clocked):
         field beside the surface turns round (section 6.7). Which side of 1 it came from is remembered by `BEYOND`.
         """
         sign = jnp.sign(value).astype(jnp.int32)
-        edge = jnp.where(jnp.abs(value) >= (1 - slack) * self.bound(k), sign, 0)
+        edge = select(jnp.abs(value) >= (1 - slack) * self.bound(k), sign, 0)
         if self.static(k):
-            edge = edge + jnp.where((self.direction < 0) & (jnp.abs(value) > 1 + slack), BEYOND * sign, 0)
+            edge = edge + select((self.direction < 0) & (jnp.abs(value) > 1 + slack), BEYOND * sign, 0)
         return edge
 
     def conditional(self, k: int) -> bool:
@@ -194,7 +195,7 @@ class SwitchedSystem(Clocked):
         if not any(map(self.conditional, range(len(mode)))):
             return mode
         return tuple(
-            jnp.where(self.absent(k, mode), OFF, m).astype(jnp.int32) if self.conditional(k) else m
+            select(self.absent(k, mode), OFF, m).astype(jnp.int32) if self.conditional(k) else m
             for k, m in enumerate(mode)
         )
 
@@ -258,7 +259,7 @@ class SwitchedSystem(Clocked):
         s = self.values(t, y, state)
         size = jax.tree.map(jnp.abs, self.field(t, y, s))
         for k in self.holdable:
-            unit = tuple(jnp.where(i == k, s[k], 0) for i in range(len(s)))
+            unit = tuple(select(i == k, s[k], 0) for i in range(len(s)))
             pull = jax.jvp(lambda s: self.field(t, y, s), (s,), (unit,))[1]
             size = jax.tree.map(lambda a, b: a + jnp.abs(b), size, pull)
         return ft.reduce(jnp.maximum, [jnp.max(x) for x in jax.tree.leaves(size)])
@@ -296,7 +297,7 @@ class SwitchedSystem(Clocked):
             k = slot.switch
             if slot.holding:
                 left = self.switches[k].bound_guard(self, slot, s[k], state)
-                rows.append([jnp.where(self.held(k, state.mode[k]), left, jnp.ones((), t.dtype))])
+                rows.append([select(self.held(k, state.mode[k]), left, jnp.ones((), t.dtype))])
             else:
                 rows.append(self.switches[k].guard_row(self, slot, t, y, state))
         return rows
@@ -316,9 +317,9 @@ class SwitchedSystem(Clocked):
                 at = roots == slot.part
                 if self.static(k):
                     at = at | (roots == slot.part * (BEYOND + 1))
-                rows.append([jnp.where(held & at, 1, none)])
+                rows.append([select(held & at, 1, none)])
                 continue
-            roots = jnp.where(held, none, roots) if k in self.holdable else roots
+            roots = select(held, none, roots) if k in self.holdable else roots
             rows.append(self.switches[k].known_row(self, slot, roots, state))
         return rows
 

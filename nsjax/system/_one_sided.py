@@ -19,6 +19,7 @@ from jaxtyping import Array
 
 from .._numerics._kinks import evaluate, has_kinks, is_partial, Seen
 from .._numerics._origins import Entry, Origins, Way
+from .._numerics._select import select
 from .._types import Scalar, Y
 from ._sgn import sgn
 from ._system import arrays_of, System
@@ -94,7 +95,7 @@ def one_sided(system: System, sides: Sides, t: Scalar, y: Y, s: tuple[Any, ...])
     if not sides.partial:
         return f
     good = ft.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(f)])
-    return jax.tree.map(lambda x, plain: jnp.where(good, x, plain), f, _field(system, t, y, s))
+    return jax.tree.map(lambda x, plain: select(good, x, plain), f, _field(system, t, y, s))
 
 
 def _told(field: Callable[[tuple], Y], sides: Sides, s: tuple[Any, ...], args: tuple) -> Y:
@@ -112,11 +113,11 @@ def _told(field: Callable[[tuple], Y], sides: Sides, s: tuple[Any, ...], args: t
 
 def _signs(h: Array, sides: list[Side | None], s: tuple[Any, ...], origins: Origins) -> Array:
     """Of the entries of h; without a switch as JAX differentiates |h|."""
-    signs = list(jnp.ravel(jnp.where(h < 0, -1, 1).astype(h.dtype)))
+    signs = list(jnp.ravel(select(h < 0, -1, 1).astype(h.dtype)))
     for n, side in enumerate(sides):
         if side is not None:
             told = side.sign * origins.sign(Entry(h, n), side.way) * jnp.sign(s[side.switch])
-            signs[n] = jnp.where(s[side.switch] == 0, signs[n], told) if side.idle else told
+            signs[n] = select(s[side.switch] == 0, signs[n], told) if side.idle else told
     return jnp.stack(signs).reshape(h.shape)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool
 
+from .._numerics._select import select
 from .._numerics._text import did_you_mean
 from ._system import is_number, System
 
@@ -114,6 +115,6 @@ class FreeParameters(eqx.Module):
         for i, path in enumerate(self.every):
             value = get_parameter(system, path)
             for row, new in zip(self.free, values):
-                value = jnp.where(row[i], new, value)
+                value = select(row[i], new, value)
             system = put_parameter(system, path, value)
         return system

@@ -6,6 +6,7 @@ from typing import Any, Self, TYPE_CHECKING
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from .._numerics._select import select
 from .._types import Guard, Scalar, Y
 from ._mode import ModeState, Slot
 from ._switch import AbstractSwitch
@@ -50,12 +51,12 @@ class relay(AbstractSwitch):
     def rising(self, system: "System", t: Scalar, y: Y, mode: Int[Array, ""]) -> Scalar:
         """The indicator function that makes it leave its mode where it rises through zero."""
         on, off = self.surfaces(system, t, y)
-        return jnp.where(mode == 1, off, on)
+        return select(mode == 1, off, on)
 
     def mode_at(self, system: "System", t: Scalar, y: Y, before: Any) -> Int[Array, ""]:
         """Its mode at a state, which within the hysteresis is the one that it had `before`."""
         on, off = (h > 0 for h in self.surfaces(system, t, y))
-        return jnp.where(on & ~off, 1, jnp.where(off, 0, before)).astype(jnp.int32)
+        return select(on & ~off, 1, select(off, 0, before)).astype(jnp.int32)
 
     def next_mode(self, mode: Int[Array, ""], direction: Any) -> Int[Array, ""]:
         return 1 - mode

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from .._numerics._jaxpr import is_affine
+from .._numerics._select import select
 from .._types import Guard, Scalar, Y
 from ._mode import BEYOND, ModeState, OFF, Slot
 from ._switch import AbstractSwitch
@@ -75,7 +76,7 @@ class sgn(AbstractSwitch):
         return mode >= 0
 
     def value(self, mode: Int[Array, ""], dtype: Any) -> Scalar:
-        return super().value(jnp.where(mode == OFF, 0, mode) if self.condition else mode, dtype)
+        return super().value(select(mode == OFF, 0, mode) if self.condition else mode, dtype)
 
     @property
     def static(self) -> bool:
@@ -95,22 +96,22 @@ class sgn(AbstractSwitch):
         h, mode, part = model.h(k, t, y), state.mode[k], state.part[k]
         one = jnp.ones((), t.dtype)
         if self.condition:
-            h = tuple(jnp.where(mode == OFF, one, hi) for hi in h)
+            h = tuple(select(mode == OFF, one, hi) for hi in h)
         if len(h) == 1:
-            return [jnp.where(mode == 0, one, mode.astype(t.dtype) * h[0])]
+            return [select(mode == 0, one, mode.astype(t.dtype) * h[0])]
         # h = min(h_1, ..., h_J). Where h > 0 each component is watched alone; where h < 0 the event is the instant at
         # which the last of them becomes positive; while sliding on one, the others end the surface at its tip.
-        alone = jnp.where((mode == 0) & (part == j), one, h[j])
+        alone = select((mode == 0) & (part == j), one, h[j])
         if j == 0:
-            return [jnp.where(mode < 0, -h[0], alone)] + [jnp.where(mode < 0, -hi, -one) for hi in h[1:]]
-        return [jnp.where(mode < 0, one, alone)]
+            return [select(mode < 0, -h[0], alone)] + [select(mode < 0, -hi, -one) for hi in h[1:]]
+        return [select(mode < 0, one, alone)]
 
     def bound_guard(self, model: "SwitchedSystem", slot: Slot, value: Scalar, state: ModeState) -> Scalar:
         left = super().bound_guard(model, slot, value, state)
         if not self.static:
             return left
         # Held backwards with |λ| > 1 it is let go where |λ| falls to 1, see `SwitchedSystem.edge`.
-        return jnp.where(state.roots[slot.switch] * slot.part <= -BEYOND, -slot.part * value - 1, left)
+        return select(state.roots[slot.switch] * slot.part <= -BEYOND, -slot.part * value - 1, left)
 
     def known_row(self, model: "SwitchedSystem", slot: Slot, roots: Any, state: ModeState) -> list[Int[Array, ""]]:
         k, j = slot.switch, slot.part
@@ -118,9 +119,9 @@ class sgn(AbstractSwitch):
         if part is None:
             return [roots]
         if j == 0:
-            row = [jnp.where((part == 0) | (mode < 0) & (part == i), roots, none) for i in range(model.parts[k])]
-            return [row[0], *[jnp.where(mode < 0, r, none) for r in row[1:]]]
-        return [jnp.where((mode >= 0) & (part == j), roots, none)]
+            row = [select((part == 0) | (mode < 0) & (part == i), roots, none) for i in range(model.parts[k])]
+            return [row[0], *[select(mode < 0, r, none) for r in row[1:]]]
+        return [select((mode >= 0) & (part == j), roots, none)]
 
     def check(self, system: "System", t: Scalar, y: Y, along: Callable[[Scalar], Y]) -> None:
         owner = type(system).__name__

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._numerics._linalg import parallel, Row, row, solve_rows, WRITTEN_OUT
+from .._numerics._select import select
 from .._types import Scalar, Y
 from ._coupling import Block, members, taken
 from ._linearisation import Linearisation, linearise
@@ -36,7 +37,7 @@ def linearised(model: "SwitchedSystem", t: Scalar, y: Y, state: ModeState, s: tu
         least = jnp.sqrt(jnp.finfo(t.dtype).tiny)
         for i in [i for i, k in enumerate(model.holdable) if k not in model.contacts]:
             total = sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(near.slope[i]))
-            trace = jnp.where(total == 0, least, 4 * jnp.finfo(t.dtype).eps * total)
+            trace = select(total == 0, least, 4 * jnp.finfo(t.dtype).eps * total)
             own = model.coupling.colour[i]
             if isinstance(near.slope[i], list):
                 near.slope[i][own] = near.slope[i][own] - trace
@@ -71,17 +72,17 @@ def _of_blocks(model: "SwitchedSystem", group: tuple[Block, ...], slope: list[An
     zero, one = jnp.zeros_like(right[0]), jnp.ones_like(right[0])
     # Off the surface a slope may vanish, and must not matter; on it the quotient is infinite, and so is noticed.
     units = [row([one if i == j else zero for j in range(m)]) for i in range(m)]
-    rows = [jax.tree.map(lambda x, h, u, i=i: jnp.where(held[i] & h, x, u), slope[i], held, units[i]) for i in range(m)]
-    right, matrix = jax.tree.map(lambda r, h: jnp.where(h, r, 0), right, held), list(rows)
+    rows = [jax.tree.map(lambda x, h, u, i=i: select(held[i] & h, x, u), slope[i], held, units[i]) for i in range(m)]
+    right, matrix = jax.tree.map(lambda r, h: select(h, r, 0), right, held), list(rows)
     for i, j in [(which.index(i), which.index(j)) for i, j in model.pairs if len(group) == 1 and i in which]:
         same = held[i] & held[j] & parallel(rows[i], rows[j])
         # The row tells in which direction each of them pushes the surface, and either of the two rows will do.
         bounds = {i: model.bound(model.holdable[which[j]]), j: -model.bound(model.holdable[which[i]])}
         weights = row([jnp.asarray(bounds.get(n, zero), zero.dtype) for n in range(m)])
-        share = jax.tree.map(lambda x, w: jnp.where(x < 0, -w, w), rows[i], weights)
-        matrix[j] = jax.tree.map(lambda a, b, same=same: jnp.where(same, a, b), share, matrix[j])
+        share = jax.tree.map(lambda x, w: select(x < 0, -w, w), rows[i], weights)
+        matrix[j] = jax.tree.map(lambda a, b, same=same: select(same, a, b), share, matrix[j])
         one_of = row([same if n == j else jnp.zeros_like(same) for n in range(m)])
-        right = jax.tree.map(lambda r, gone: jnp.where(gone, 0, r), right, one_of)
+        right = jax.tree.map(lambda r, gone: select(gone, 0, r), right, one_of)
     return solve_rows(matrix, right)
 
 
@@ -104,7 +105,7 @@ def resolved(model: "SwitchedSystem", t: Scalar, y: Y, state: ModeState) -> tupl
         return after(s, move), near.pulled(near.field, move)
     # Newton's method for a multi-affine field, in a fixed number of steps: such a loop can be transposed. Friction
     # proportional to a contact force has no effect where that is zero: the search sets out from another value.
-    begin = [jnp.where(h, 1, s[k]) if k in model.contacts else s[k] for k, h in zip(which, held)]
+    begin = [select(h, 1, s[k]) if k in model.contacts else s[k] for k, h in zip(which, held)]
     s = lax.fori_loop(0, 6, lambda _, s: after(s, moves(s)[0]), put(s, which, begin))
     return s, model.field(t, y, s)
 
@@ -124,7 +125,7 @@ def project(model: "SwitchedSystem", t: Scalar, y: Y, state: ModeState) -> Y:
     def closing(gaps: list[Scalar]) -> Row:
         """The values which close the gaps."""
         found = multipliers(model, near.slope, row([-g for g in gaps]), held)
-        return jax.tree.map(lambda h, d: jnp.where(h, d, 0), held, found)
+        return jax.tree.map(lambda h, d: select(h, d, 0), held, found)
 
     if model.contacts:
         gaps = [model.h(k, t, y)[0] if k in model.contacts else jnp.zeros_like(t) for k in which]

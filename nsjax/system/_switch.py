@@ -9,9 +9,9 @@ from functools import partial
 from typing import Any, ClassVar, Self, TYPE_CHECKING
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from .._numerics._select import select
 from .._types import Guard, Scalar, Y
 from ._mode import ModeState, pick, Slot
 
@@ -114,7 +114,7 @@ class AbstractSwitch(abc.ABC):
     def known_row(self, model: "SwitchedSystem", slot: Slot, roots: Any, state: ModeState) -> list[Int[Array, ""]]:
         """How many roots each entry of `guard_row` has at the present instant, of `roots` that its surface has."""
         part = state.part[slot.switch]
-        return [roots] if part is None else [jnp.where(part == slot.part, roots, 0)]
+        return [roots] if part is None else [select(part == slot.part, roots, 0)]
 
     # Mistakes.
 

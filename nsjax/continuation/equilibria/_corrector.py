@@ -14,6 +14,7 @@ from ..._numerics._bracket import bracketed
 from ..._numerics._compile import interactive
 from ..._numerics._linalg import bialternate
 from ..._numerics._root import find_root, Newton
+from ..._numerics._select import select
 from ._equations import EquilibriumCurve as Curve
 
 
@@ -48,7 +49,7 @@ def _tangent(curve: Curve, u: Array, border: Array, mode: Array) -> Array:
 def distances(curve: Curve, u: Array) -> Array:
     """The guards, divided by their gradients."""
     gradients = jnp.linalg.norm(jax.lax.stop_gradient(jax.jacfwd(curve.guards)(u)), axis=-1)
-    return curve.guards(u) / jnp.where(gradients == 0, 1, gradients)
+    return curve.guards(u) / select(gradients == 0, 1, gradients)
 
 
 def _determinants(curve: Curve, u: Array, border: Array, mode: Array) -> tuple[Array, Array]:
@@ -64,7 +65,7 @@ def _determinants(curve: Curve, u: Array, border: Array, mode: Array) -> tuple[A
 def _scale(curve: Curve, origin: Array, border: Array, mode: Array) -> Array:
     """What determinants are divided by along a step."""
     logs = _determinants(curve, origin, border, mode)[1]
-    return jnp.where(jnp.isfinite(logs), logs, 0)
+    return select(jnp.isfinite(logs), logs, 0)
 
 
 def _tests(curve: Curve, u: Array, border: Array, mode: Array, scale: Array) -> Array:
@@ -84,7 +85,7 @@ def _corrected(curve: Curve, origin: Array, tangent: Array, s: Array, guess: Arr
     slopes = jax.jacfwd(curve.residual)(guess, mode)
     # Equations in units of the unknowns, so that tolerances mean the same for all.
     rows = jnp.max(jnp.abs(slopes), axis=1)
-    rows = jnp.where(rows == 0, 1, rows)
+    rows = select(rows == 0, 1, rows)
 
     def residual(u: Array, _: Any) -> Array:
         return jnp.append(curve.residual(u, mode) / rows, tangent @ (u - origin) - s)
@@ -162,7 +163,7 @@ def on_surface(curve: Curve, u: Array, mode: Array, which: Array) -> Array:
         return jnp.append(curve.residual(u, mode), distances(curve, u)[which])
 
     found, good = find_root(residual, u, None, Newton(TOLERANCE, 12))
-    return jnp.where(good, found, u)
+    return select(good, found, u)
 
 
 @ft.partial(interactive, host=True)
@@ -195,9 +196,9 @@ def row_sizes(curve: Curve, u: Array, mode: Array) -> Array:
     # the middle of a rotor's stator the field of contact has no derivative; but there is no contact.)
     alone = (df != 0) & (jnp.sum(df != 0, axis=1, keepdims=True) == 1) & ~jnp.any(bends, axis=(1, 2))[:, None]
     varies = ~jnp.any(alone, axis=0)
-    bends = jnp.where(varies[:, None] & varies[None, :], bends, 0)
+    bends = select(varies[:, None] & varies[None, :], bends, 0)
     size = jnp.max(jnp.abs(df), axis=1) + jnp.max(jnp.abs(bends), axis=(1, 2))
-    return jnp.where(size > 0, size, 1)
+    return select(size > 0, size, 1)
 
 
 @ft.partial(interactive, host=True)

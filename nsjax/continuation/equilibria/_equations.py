@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..._numerics._compile import interactive
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...equilibria._equilibrium import (
     all_decay,
@@ -236,7 +237,7 @@ def first_lyapunov_coefficient(curve: EquilibriumCurve, u: Array, mode: Array) -
     b = jax.jacfwd(jax.jacfwd(field))(x).astype(complex)
     c = jax.jacfwd(jax.jacfwd(jax.jacfwd(field)))(x).astype(complex)
     roots, right = jnp.linalg.eig(a)
-    pair = jnp.argmin(jnp.where(roots.imag > 0, jnp.abs(roots.real), jnp.inf))
+    pair = jnp.argmin(select(roots.imag > 0, jnp.abs(roots.real), jnp.inf))
     omega, q = roots[pair].imag, right[:, pair]
     p = jnp.linalg.inv(right)[pair]  # p q = 1, |q| = 1
     eye = jnp.eye(len(x), dtype=b.dtype)

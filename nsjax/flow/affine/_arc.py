@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..._numerics._barrier import stored
+from ..._numerics._select import select
 from ._plan import Plan
 
 
@@ -111,5 +112,5 @@ def _arrived_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     moves = jax.jvp(lambda z, rows: _shifted(z, rows, shift), (z, rows), (dz, drows))[1]
     f = [*[full(dot(row, there), shift) for row in rows], jnp.zeros_like(shift)]
     slope, change = dot(guard, f), dot(guard, moves) + dot(dguard, there)
-    moved = jnp.where(meets, -change / jnp.where(meets, slope, 1), 0)
+    moved = select(meets, -change / select(meets, slope, 1), 0)
     return (shift, there), (moved, [d + a * moved for d, a in zip(moves, f)])

@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from ..._numerics._lane_cond import compact_cond
 from ..._numerics._lanes import in_lanes
+from ..._numerics._select import select
 from ...system._mode import ModeState
 from .._loop import Carry, Flow
 from ._lane import entered, Lane, Lanes, left, logged, MISSING, Row
@@ -95,9 +96,9 @@ def _tabulated(problem: Problem, table: Table, used: Lanes, lane: Lane) -> tuple
         )
         place = used % kept
         table = jax.tree.map(
-            lambda old, x: jnp.stack([jnp.where(wanted & (place == i), x, old[i]) for i in range(kept)]), table, new
+            lambda old, x: jnp.stack([select(wanted & (place == i), x, old[i]) for i in range(kept)]), table, new
         )
-        return table, used + wanted.astype(used.dtype), jnp.where(wanted, place, index)
+        return table, used + wanted.astype(used.dtype), select(wanted, place, index)
 
     table, used, index = lax.cond(jnp.any(wanted), build, lambda args: args, (table, used, lane.index))
     return table, used, lane._replace(index=index)
@@ -126,7 +127,7 @@ def _general(problem: Problem, table: Table, carry: Carry, lane: Lane) -> tuple[
     def go(args: tuple) -> tuple:
         carry, lane = args
         length = picked(table.length, lane.index)
-        before = left(problem, lane, carry, jnp.where(many(flow, length), carry.dt, 0.3 * length))
+        before = left(problem, lane, carry, select(many(flow, length), carry.dt, 0.3 * length))
         if before.log is None:
             after = by_lane(_one_turn, flow, waits, before)
         else:  # not with the log itself, which is long
@@ -138,7 +139,7 @@ def _general(problem: Problem, table: Table, carry: Carry, lane: Lane) -> tuple[
         return after, back(after, lane)
 
     def back(after: Carry, lane: Lane) -> Lane:
-        new = entered(problem, table, after, jnp.where(waits, after.dt, lane.wait))
+        new = entered(problem, table, after, select(waits, after.dt, lane.wait))
         stays = waits & ((after.accepted == lane.accepted) | ~problem.constants.fits)
         return new._replace(slow=stays & after.active)
 

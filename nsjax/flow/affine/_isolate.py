@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..._numerics._barrier import once
 from ..._numerics._bernstein import binomials
+from ..._numerics._select import select
 
 
 DEPTH = 24  # halvings of an arc; what they do not separate is left to the general flow
@@ -39,15 +40,15 @@ class _Look(NamedTuple):
 def _look(a: Array, known: Int[Array, "rows lanes"], size: Array) -> _Look:
     count = a.shape[1]
     # What is known at the start is divided out: that drops the first coefficients.
-    first = jnp.where(known == 0, a[:, 0], jnp.where(known == 1, a[:, 1], jnp.where(known == 2, a[:, 2], a[:, 3])))
-    kept = [jnp.where(known > j, first, a[:, j]) if j < 3 else a[:, j] for j in range(count)]
+    first = select(known == 0, a[:, 0], select(known == 1, a[:, 1], select(known == 2, a[:, 2], a[:, 3])))
+    kept = [select(known > j, first, a[:, j]) if j < 3 else a[:, j] for j in range(count)]
     signs = [x > 0 for x in kept]
     changes = [(p != q).astype(jnp.int32) for p, q in zip(signs, signs[1:])]
     variations = sum(changes[1:], changes[0])
     weights = binomials(count - 1)
     least = ft.reduce(jnp.minimum, [x / w for x, w in zip(kept, weights)])
     largest = ft.reduce(jnp.maximum, [jnp.abs(x) / w for x, w in zip(kept, weights)])
-    near = (variations == 0) & ~(least > NEAR * jnp.where(known > 0, largest, size))
+    near = (variations == 0) & ~(least > NEAR * select(known > 0, largest, size))
     some = jnp.sum((variations > 0).astype(jnp.int32), axis=0)
     many = (some > 1) | jnp.any(variations > 1, axis=0)
     return _Look(variations, jnp.any(~signs[0], axis=0), jnp.any(near, axis=0), many)
@@ -81,7 +82,7 @@ def isolate(
     def halve(carry: tuple) -> tuple:
         depth, a, share, seen = carry
         again = seen.many & wanted
-        a, share = jnp.where(again, _halved(a), a), jnp.where(again, 0.5 * share, share)
+        a, share = select(again, _halved(a), a), select(again, 0.5 * share, share)
         return depth + 1, a, share, _look(a, known, size)
 
     _, a, share, seen = lax.while_loop(busy, halve, (jnp.zeros((), jnp.int32), a, share, seen))
@@ -101,20 +102,18 @@ def root(a: Float[Array, "coefficients lanes"], known: Int[Array, " lanes"], wan
     """The only root on (0, 1] of polynomials with one sign variation, after those known at 0 have been divided out: by
     Halley's method from the eighth of the interval in which it is."""
     n = len(a) - 1
-    signs = [jnp.where(known > j, 0, a[j]) if j < 3 else a[j] for j in range(n + 1)]
+    signs = [select(known > j, 0, a[j]) if j < 3 else a[j] for j in range(n + 1)]
     late = once(sum(signs[1:], signs[0])) > 0
     shifted = [list(a), [*a[1:], *[0 * a[0]]], [*a[2:], *[0 * a[0]] * 2], [*a[3:], *[0 * a[0]] * 3]]
-    early = [
-        jnp.where(known == 0, p, jnp.where(known == 1, q, jnp.where(known == 2, r, s))) for p, q, r, s in zip(*shifted)
-    ]
-    c = [jnp.where(late, -x, y) for x, y in zip(reversed(list(a)), early)]
+    early = [select(known == 0, p, select(known == 1, q, select(known == 2, r, s))) for p, q, r, s in zip(*shifted)]
+    c = [select(late, -x, y) for x, y in zip(reversed(list(a)), early)]
     points = [j / 8 for j in range(5)]
     values = [once(sum(x * (u**j * (1 - u) ** (n - j)) for j, x in enumerate(c))) if u else c[0] for u in points]
     low, first, last = jnp.full_like(c[0], points[3]), values[3], values[4]
     for k in (2, 1, 0):
         here = values[k + 1] <= 0
         low, first, last = (
-            jnp.where(here, x, y) for x, y in zip((points[k], values[k], values[k + 1]), (low, first, last))
+            select(here, x, y) for x, y in zip((points[k], values[k], values[k + 1]), (low, first, last))
         )
     low = once(low)
     u = once(low + 0.125 * jnp.clip(first / (first - last), 0, 1))
@@ -125,7 +124,7 @@ def root(a: Float[Array, "coefficients lanes"], known: Int[Array, " lanes"], wan
         slope, bend = w * (w * slope - n * value), w * w * (w * w * bend - (n - 1) * (w * slope - 0.5 * n * value))
         newton = value / slope
         ratio = newton * bend / slope
-        new = u - newton / jnp.where(jnp.abs(ratio) < 0.5, 1 - ratio, 1)
+        new = u - newton / select(jnp.abs(ratio) < 0.5, 1 - ratio, 1)
         before, u = u, once(jnp.clip(new, low, low + 0.125))
     # The few that have not converged: by bisection.
     poor = wanted & ~(jnp.abs(u - before) < 1e-3)
@@ -134,11 +133,11 @@ def root(a: Float[Array, "coefficients lanes"], known: Int[Array, " lanes"], wan
         count, low, high = carry
         middle = 0.5 * (low + high)
         above = _horner(c, middle / (1 - middle))[0] > 0
-        return count + 1, jnp.where(above, middle, low), jnp.where(above, high, middle)
+        return count + 1, select(above, middle, low), select(above, high, middle)
 
     def again(u: Array) -> Array:
         start = (jnp.zeros((), jnp.int32), jnp.zeros_like(u), jnp.full_like(u, 0.5))
-        return jnp.where(poor, lax.while_loop(lambda c: c[0] < 50, bisect, start)[2], u)
+        return select(poor, lax.while_loop(lambda c: c[0] < 50, bisect, start)[2], u)
 
     u = lax.cond(jnp.any(poor), again, lambda u: u, u)
-    return jnp.where(late, 1 - u, u)
+    return select(late, 1 - u, u)

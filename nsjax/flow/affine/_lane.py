@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..._numerics._select import select
 from ..._types import Y
 from ...system._mode import ModeState
 from .._loop import Carry, Flow
@@ -69,7 +70,7 @@ def found_in(table: Table, modes: tuple[Numbers, ...], like: Numbers) -> Numbers
     key = jnp.zeros_like(like) if not modes else key_of(modes)
     index = jnp.full_like(like, MISSING)
     for i, other in enumerate(table.key):
-        index = jnp.where(other == key, i, index)
+        index = select(other == key, i, index)
     return index
 
 
@@ -84,7 +85,7 @@ def entered(problem: Problem, table: Table, c: Carry, wait: Lanes) -> Lane:
             for row in plan.rows:
                 free, held = ([None] if i is None else found[i] for i in (row.free, row.held))
                 if free[0] is not None and held[0] is not None:
-                    out.append(jnp.where(flow.model.held(row.switch, state.mode[row.switch]), held[0], free[0]))
+                    out.append(select(flow.model.held(row.switch, state.mode[row.switch]), held[0], free[0]))
                 else:
                     out.append(held[0] if free[0] is None else free[0])
             return out
@@ -121,10 +122,10 @@ def left(problem: Problem, lane: Lane, c: Carry, dt: Lanes) -> Carry:
         if k in flow.model.holdable:
             held = flow.model.held(k, lane.modes[k])
             edge = own[0][1] - (own[1][1] if len(own) > 1 else 0)
-            roots.append(jnp.where(held, edge, own[0][1]))
+            roots.append(select(held, edge, own[0][1]))
         else:
             roots.append(own[0][1])
-    kept = [jnp.where(lane.moved, new, old).astype(jnp.int32) for new, old in zip(roots, c.state.roots)]
+    kept = [select(lane.moved, new, old).astype(jnp.int32) for new, old in zip(roots, c.state.roots)]
     state = ModeState(lane.modes, c.state.part, tuple(kept))
     f = by_lane(lambda flow, t, y, state: flow.model.flow(t, y, state), flow, lane.t, y, state)
     moved, zero = lane.moved, jnp.zeros_like(c.halted)
@@ -132,16 +133,16 @@ def left(problem: Problem, lane: Lane, c: Carry, dt: Lanes) -> Carry:
         c,
         t=lane.t,
         y=y,
-        f=jax.tree.map(lambda a, b: jnp.where(moved, a, b), f, c.f),
+        f=jax.tree.map(lambda a, b: select(moved, a, b), f, c.f),
         state=state,
-        dt=jnp.where(moved, dt, c.dt),
+        dt=select(moved, dt, c.dt),
         active=lane.active,
         steps=lane.steps,
         accepted=lane.accepted,
         events=lane.events,
-        halted=jnp.where(moved, zero, c.halted),
-        halvings=jnp.where(moved, zero, c.halvings),
-        crawled=jnp.where(moved, zero, c.crawled),
+        halted=select(moved, zero, c.halted),
+        halvings=select(moved, zero, c.halvings),
+        crawled=select(moved, zero, c.crawled),
         forked=lane.forked,
         log=lane.log,
         saved=lane.saved,
@@ -182,7 +183,7 @@ def logged(log: Log, index: Numbers, when: Truths, row: tuple[Any, ...]) -> Log:
     """`Log.write` for all lanes."""
 
     def put(buffer: Array, value: Array) -> Array:
-        place = jnp.where(when, index, buffer.shape[0])
+        place = select(when, index, buffer.shape[0])
         if buffer.ndim == 2:
             return _put(buffer, place, value)
         values = value.reshape(-1, value.shape[-1])

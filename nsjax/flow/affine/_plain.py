@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._numerics._autodiff import frozen
+from ..._numerics._select import select
 from ...system._impact import impact
 from .._loop import Flow
 from ._arc import dot, Rows
@@ -66,12 +67,12 @@ def plain(flow: Flow, plan: Plan, constants: Constants, m: Meeting) -> Plain:
             new = _sign(flow, plan, constants, m, k, rows)
         sure = new.sure & (not switch.ends)
         out = Plain(
-            jnp.where(now, sure, out.sure),
-            [jnp.where(now, a, b) for a, b in zip(new.x, out.x)] if new.x is not m.z else out.x,
-            tuple(jnp.where(now, a, b) if i == k else b for i, (a, b) in enumerate(zip(new.modes, out.modes))),
-            [jnp.where(now, a, b) if r in rows else b for r, (a, b) in enumerate(zip(new.known, out.known))],
-            jnp.where(now, new.slot, out.slot),
-            jnp.where(now, new.forked, out.forked),
+            select(now, sure, out.sure),
+            [select(now, a, b) for a, b in zip(new.x, out.x)] if new.x is not m.z else out.x,
+            tuple(select(now, a, b) if i == k else b for i, (a, b) in enumerate(zip(new.modes, out.modes))),
+            [select(now, a, b) if r in rows else b for r, (a, b) in enumerate(zip(new.known, out.known))],
+            select(now, new.slot, out.slot),
+            select(now, new.forked, out.forked),
         )
     return out
 
@@ -88,21 +89,21 @@ def _sign(flow: Flow, plan: Plan, constants: Constants, m: Meeting, k: int, rows
     gain, bound, rate = frozen(constants.gain[k]), frozen(constants.bound[k]), frozen(m.rate)
     held, attracts = mode == 0, gain < 0
     # With h' = gain (s - λ) on the side from which it comes, this is 1 - λ times the sign of that side.
-    way = rate / jnp.where(gain == 0, 1, gain)
+    way = rate / select(gain == 0, 1, gain)
     holds = attracts & (way <= 1 + bound)
     clear = (jnp.abs(way) > tiny) & (jnp.abs(jnp.abs(way - 1) - bound) > tiny * (1 + bound)) & (gain != 0)
     # With 1 < |λ| <= b it might hold or cross; what repels is crossed.
-    forked = ~held & jnp.where(attracts, holds & (way > 2), 1 - way <= bound)
+    forked = ~held & select(attracts, holds & (way > 2), 1 - way <= bound)
     if model.static(k):
         clear = clear & (~attracts | (jnp.abs(way - 2) > tiny))
-    side = jnp.where(m.fires[rows[0]], 1, -1)
-    after = jnp.where(held, side, jnp.where(holds, 0, -mode)).astype(mode.dtype)
+    side = select(m.fires[rows[0]], 1, -1)
+    after = select(held, side, select(holds, 0, -mode)).astype(mode.dtype)
     # With b = 1 dh/dt is zero where λ reaches it.
     smooth, jumps = bound - 1 <= 1e-13, bound - 1 > tiny
-    fresh = jnp.where(held & smooth, 2, 1).astype(mode.dtype)
-    known[rows[0]] = jnp.where(after == 0, 0, fresh).astype(mode.dtype)
-    slot = jnp.where(held, jnp.where(side > 0, plan.rows[rows[0]].held, plan.rows[rows[1]].held), row.free)  # type: ignore
-    sure = jnp.where(held, attracts & (smooth | jumps), clear) & (model.direction > 0)
+    fresh = select(held & smooth, 2, 1).astype(mode.dtype)
+    known[rows[0]] = select(after == 0, 0, fresh).astype(mode.dtype)
+    slot = select(held, select(side > 0, plan.rows[rows[0]].held, plan.rows[rows[1]].held), row.free)  # type: ignore
+    sure = select(held, attracts & (smooth | jumps), clear) & (model.direction > 0)
     modes = tuple(after if i == k else other for i, other in enumerate(m.modes))
     return Plain(sure, m.z, modes, known, slot.astype(mode.dtype), forked)
 
@@ -116,12 +117,12 @@ def _rebound(flow: Flow, plan: Plan, constants: Constants, m: Meeting, k: int) -
     known[row] = one
     level, push = list(constants.level[k]), list(constants.push[k])
     rate, gain, e = dot(level, m.z), constants.gain[k], constants.restitution[k]
-    impulse = -(1 + e) * rate / jnp.where(gain == 0, 1, gain)
+    impulse = -(1 + e) * rate / select(gain == 0, 1, gain)
     x = [a + impulse * b for a, b in zip(m.z, push)]
     z = frozen([*x, *m.z[n:]])
     rise, size = dot(frozen(level), z), magnitude(frozen(level), z)
     pull = dot(frozen(level), [dot(frozen(row), z) for row in m.matrix])
-    flight = 2 * rise / jnp.where(pull < 0, -pull, 1)
+    flight = 2 * rise / select(pull < 0, -pull, 1)
     brief = jnp.maximum(eps**0.5 * (m.t - flow.t0), 1e4 * eps * jnp.abs(m.t))
     guard = frozen(m.guards[row])
     noise = 64 * eps * (magnitude(guard, z) + jnp.abs(m.t * rise))

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..._numerics._autodiff import frozen
 from ..._numerics._jaxpr import dependence, is_constant
+from ..._numerics._select import select
 from ..._numerics._series import Series
 from ..._types import Scalar, Y
 from ...system._impact import impact
@@ -150,7 +151,7 @@ def of_mode(flow: Flow, rows: Any, y: Y, state: ModeState) -> Callable[[Scalar, 
         for row in rows:
             free, held = ([] if i is None else guards[i] for i in (row.free, row.held))
             if free and held:
-                values.append(jnp.where(model.held(row.switch, state.mode[row.switch]), held[0], free[0]))
+                values.append(select(model.held(row.switch, state.mode[row.switch]), held[0], free[0]))
             else:
                 values.append((free or held)[0])
         parts = [jfu.ravel_pytree(model.flow(t, y, state))[0], *[v[None] for v in values]]
@@ -185,7 +186,7 @@ def constants(flow: Flow, plan: Plan, y: Y) -> Constants:
 
     push, gain, level, bound, restitution = {}, {}, {}, {}, {}
     for k in model.holdable:
-        unit = tuple(jnp.where(i == k, 1, 0).astype(t.dtype) for i in range(len(zeros)))
+        unit = tuple(select(i == k, 1, 0).astype(t.dtype) for i in range(len(zeros)))
         push[k] = jax.jvp(field, (zeros,), (unit,))[1]
         if k in model.contacts:
             free = ModeState.of([jnp.zeros((), jnp.int32)] * len(zeros), [None] * len(zeros))
@@ -213,17 +214,17 @@ def _forcing(model: SwitchedSystem, plan: Plan, t: Scalar, y: Y) -> tuple[Scalar
     terms = [series.step(k, t if k == 0 else jnp.ones_like(t) if k == 1 else None)[0] for k in range(5)]
     b1, b2, b3, b4 = (jnp.zeros_like(now) if c is None else w * c for w, c in zip((1.0, 2.0, 6.0, 24.0), terms[1:]))
     size = b1 @ b1 + b2 @ b2
-    squared = -(b1 @ b3 + b2 @ b4) / jnp.where(size == 0, 1, size)
+    squared = -(b1 @ b3 + b2 @ b4) / select(size == 0, 1, size)
     fits = frozen(squared) >= 0
-    return jnp.where(fits, squared, 0), jnp.stack([b1, b2, now], axis=1), lax.stop_gradient(fits)
+    return select(fits, squared, 0), jnp.stack([b1, b2, now], axis=1), lax.stop_gradient(fits)
 
 
 def clock(since: Scalar, squared: Scalar) -> tuple[Scalar, Scalar]:
     """S = sin(ωτ)/ω and C = (1 - cos ωτ)/ω², for ω² = 0 too: τ and τ²/2."""
     still = squared == 0
-    rate = jnp.sqrt(jnp.where(still, 1, squared))
+    rate = jnp.sqrt(select(still, 1, squared))
     half = jnp.sin(0.5 * rate * since) / rate
-    return jnp.where(still, since, jnp.sin(rate * since) / rate), jnp.where(still, 0.5 * since**2, 2 * half**2)
+    return select(still, since, jnp.sin(rate * since) / rate), select(still, 0.5 * since**2, 2 * half**2)
 
 
 def numbers(model: SwitchedSystem) -> int:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._numerics._autodiff import frozen
 from ..._numerics._barrier import once, stored
 from ..._numerics._bernstein import binomials
+from ..._numerics._select import select
 from .._loop import Flow
 from .._save import Log, Saved
 from ..steppers._exponential import _N
@@ -53,7 +54,7 @@ class There(NamedTuple):
 
 def picked(table: Any, index: Int[Array, " lanes"]) -> Any:
     """What belongs to the mode of each lane."""
-    return ft.reduce(lambda found, i: jnp.where(index == i, table[i], found), range(1, len(table)), table[0])
+    return ft.reduce(lambda found, i: select(index == i, table[i], found), range(1, len(table)), table[0])
 
 
 def look(plan: Plan, table: Table, lane: Lane, flow: Flow, live: Truths) -> Arc:
@@ -70,8 +71,8 @@ def look(plan: Plan, table: Table, lane: Lane, flow: Flow, live: Truths) -> Arc:
         found = isolate(a, known, missed, live)
         fires = found.fires & live
         event = jnp.any(fires, axis=0)
-        chosen = once(jnp.sum(jnp.where(fires[:, None], found.coefficients, 0), axis=0))
-        at = root(chosen, jnp.sum(jnp.where(fires, known, 0), axis=0), event)
+        chosen = once(jnp.sum(select(fires[:, None], found.coefficients, 0), axis=0))
+        at = root(chosen, jnp.sum(select(fires, known, 0), axis=0), event)
         share, doubtful = found.share, found.doubtful
     left, ahead = frozen(span), share * length
     tau = at * ahead
@@ -79,7 +80,7 @@ def look(plan: Plan, table: Table, lane: Lane, flow: Flow, live: Truths) -> Arc:
     doubtful = doubtful | (event & ((at * share < SOON) | (jnp.abs(tau - left) <= slack)))
     event = event & (tau <= left)
     final = ~event & (ahead >= left) & live
-    tau = jnp.where(final, span, frozen(jnp.where(live, jnp.where(event, tau, ahead), 0)))
+    tau = select(final, span, frozen(select(live, select(event, tau, ahead), 0)))
     return Arc(once(tau), event, fires & event, final, doubtful, length)
 
 
@@ -92,13 +93,12 @@ def go(plan: Plan, rows: list[Rows], guards: list[Rows], projection: Any, z: Row
     if not guards:
         return There(z, nought, nought, ~arc.doubtful, nought, terms)
     w = [
-        stored(sum(jnp.where(arc.fires[r], full(row[q], like), 0) for r, row in enumerate(guards)))
-        for q in range(len(z))
+        stored(sum(select(arc.fires[r], full(row[q], like), 0) for r, row in enumerate(guards))) for q in range(len(z))
     ]
     f = [full(dot(row, z), like) for row in rows]
     bend = [full(dot(row, [*f, None]), like) for row in rows]
     value, rate = frozen((dot(w, z), dot(w[:-1], f)))
-    shift = jnp.where(event, -value / jnp.where(rate == 0, 1, rate), 0)
+    shift = select(event, -value / select(rate == 0, 1, rate), 0)
     z = [*[stored(x + shift * (a + 0.5 * shift * b)) for x, a, b in zip(z, f, bend)], z[-1]]
     if projection is not None:
         z = [*[stored(dot(row, z)) for row in projection], *z[plan.size :]]
@@ -108,7 +108,7 @@ def go(plan: Plan, rows: list[Rows], guards: list[Rows], projection: Any, z: Row
     size = magnitude(w0[:-1], f0)
     drift = dot(w0[plan.size : -1], f0[plan.size :]) if plan.timed else nought
     normal, speed = sum(x * x for x in w0[: plan.size]), sum(x * x for x in f0[: plan.size])
-    cosine = jnp.abs(rate) / jnp.sqrt((normal + drift**2) * (speed + jnp.where(drift == 0, 0, 1)))
+    cosine = jnp.abs(rate) / jnp.sqrt((normal + drift**2) * (speed + select(drift == 0, 0, 1)))
     clear = (rate < -1e2 * small(like) * size) & (cosine > 1e2 * small(like))
     delay, moved = arrived(z, rows, w, event)
     z = [*[stored(x) for x in moved[:-1]], z[-1]]
@@ -128,7 +128,7 @@ def turn(problem: Problem, table: Table, lane: Lane) -> Lane:
     if projection is not None:
         projection = [[picked(projection[:, i, j], lane.index) for j in range(m)] for i in range(n)]
     there = go(plan, rows, guards, projection, [*lane.x, *lane.clock, jnp.ones_like(lane.t)], arc, theta)
-    t = jnp.where(arc.final, flow.t1, lane.t + arc.tau + there.shift)
+    t = select(arc.final, flow.t1, lane.t + arc.tau + there.shift)
     sure = ~arc.doubtful & there.sure
     if plan.timed:
         sure = sure & _as_predicted(problem, t, there.z)
@@ -146,7 +146,7 @@ def turn(problem: Problem, table: Table, lane: Lane) -> Lane:
         sure = sure & (lane.events + 1 < flow.max_events)
     sure = sure & (sum(0 * frozen(v) for v in [*after.x, t]) == 0)
     moved, event = live & sure, live & sure & arc.event
-    end = End(t, there, after._replace(x=[jnp.where(event, a, b) for a, b in zip(after.x, there.z)]), moved, event)
+    end = End(t, there, after._replace(x=[select(event, a, b) for a, b in zip(after.x, there.z)]), moved, event)
     new = _moved(plan, table, lane, end)
     if lane.log is not None:
         new = new._replace(log=_written(problem, lane, end))
@@ -187,21 +187,21 @@ def _moved(plan: Plan, table: Table, lane: Lane, end: End) -> Lane:
     none, one = jnp.zeros_like(lane.steps), jnp.ones_like(lane.steps)
 
     def choose(which: Truths, new: Rows, old: Rows) -> Rows:
-        return [jnp.where(which, a, b) for a, b in zip(new, old)]
+        return [select(which, a, b) for a, b in zip(new, old)]
 
     modes = tuple(choose(event, [*after.modes], [*lane.modes]))
     return lane._replace(
-        t=jnp.where(moved, t, lane.t),
+        t=select(moved, t, lane.t),
         x=choose(moved, after.x, lane.x),
         clock=choose(moved, there.z[plan.size : -1], lane.clock),
         modes=modes,
-        known=[jnp.where(event, a, jnp.where(moved, none, b)) for a, b in zip(after.known, lane.known)],
-        index=jnp.where(event, found_in(table, modes, none), lane.index),
-        wait=jnp.where(moved, 1.26 * lane.wait, lane.wait),
+        known=[select(event, a, select(moved, none, b)) for a, b in zip(after.known, lane.known)],
+        index=select(event, found_in(table, modes, none), lane.index),
+        wait=select(moved, 1.26 * lane.wait, lane.wait),
         moved=lane.moved | moved,
-        steps=lane.steps + jnp.where(moved, one, none),
-        accepted=lane.accepted + jnp.where(moved, one, none),
-        events=lane.events + jnp.where(event, one, none),
+        steps=lane.steps + select(moved, one, none),
+        accepted=lane.accepted + select(moved, one, none),
+        events=lane.events + select(event, one, none),
         forked=lane.forked | (event & after.forked),
     )
 
@@ -256,7 +256,7 @@ def _points(plan: Plan, arc: Arc, there: There, like: Any) -> Any:
     """Control points of the arc, from the terms of its series."""
     weights, _ = economised(_N, TERMS)
     weights = weights / np.array(binomials(_N))[:, None]
-    longer = 1 + there.shift / jnp.where(arc.event, arc.tau, 1)
+    longer = 1 + there.shift / select(arc.event, arc.tau, 1)
     x = jnp.stack([jnp.stack([full(v, longer) for v in term[: plan.size]]) for term in there.terms])
     powers = jnp.stack([longer**j for j in range(len(there.terms))])
     points = jnp.tensordot(jnp.asarray(weights, x.dtype), x * powers[:, None], axes=1)

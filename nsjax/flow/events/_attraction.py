@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..._numerics._autodiff import frozen
 from ..._numerics._linalg import linear_solve, parallel
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
@@ -18,7 +19,7 @@ Pairs = dict[tuple[int, int], tuple[Bool[Array, ""], Float[Array, ""]]]
 
 def reach(model: SwitchedSystem, matrix: Float[Array, "m m"]) -> Float[Array, " m"]:
     """How much the values of all `sgn` switches together may change dh/dt of each surface."""
-    return jnp.sum(jnp.where(np.array([k not in model.contacts for k in model.holdable]), jnp.abs(matrix), 0), axis=1)
+    return jnp.sum(select(np.array([k not in model.contacts for k in model.holdable]), jnp.abs(matrix), 0), axis=1)
 
 
 def negligible(rate: Scalar, span: Scalar) -> Bool[Array, ""]:
@@ -67,10 +68,10 @@ def _within_block(matrix: Float[Array, "m m"], held: Bool[Array, " m"], pairs: P
     whole, first = _as_one(matrix, held, pairs)
     inverse, inner = _inverse(whole, first)
     free = jnp.diag(whole) - jnp.sum((whole @ inner) * whole.T, axis=1)
-    out = jnp.where(first, 1 / jnp.diag(inverse), free)
+    out = select(first, 1 / jnp.diag(inverse), free)
     size = jnp.sum(jnp.abs(matrix), axis=1)
     for (i, j), (same, _) in pairs.items():
-        out = jnp.where(same & (np.arange(m) == j), out[i] * size[j] / size[i], out)
+        out = select(same & (np.arange(m) == j), out[i] * size[j] / size[i], out)
     return out
 
 
@@ -84,7 +85,7 @@ def _as_one(
     for (i, j), (same, ratio) in pairs.items():
         swap = np.arange(m)
         swap[[i, j]] = j, i
-        whole = whole + jnp.where(same & (swap != np.arange(m)), ratio, 0) * matrix[:, swap]
+        whole = whole + select(same & (swap != np.arange(m)), ratio, 0) * matrix[:, swap]
         first = first & ~(same & held[i] & (np.arange(m) == j))
     return whole, first
 
@@ -92,8 +93,8 @@ def _as_one(
 def _inverse(whole: Float[Array, "m m"], first: Bool[Array, " m"]) -> tuple[Float[Array, "m m"], Float[Array, "m m"]]:
     """The inverse over what is held, with the identity for the rest and with zero."""
     eye, both = jnp.eye(len(first), dtype=whole.dtype), first[:, None] & first[None, :]
-    inverse = jax.vmap(linear_solve, in_axes=(None, 0), out_axes=1)(jnp.where(both, whole, eye), eye)
-    return inverse, jnp.where(both, inverse, 0)
+    inverse = jax.vmap(linear_solve, in_axes=(None, 0), out_axes=1)(select(both, whole, eye), eye)
+    return inverse, select(both, inverse, 0)
 
 
 def escapes(model: SwitchedSystem, t: Scalar, y: Y, state: ModeState) -> Bool[Array, ""]:
@@ -115,7 +116,7 @@ def escapes(model: SwitchedSystem, t: Scalar, y: Y, state: ModeState) -> Bool[Ar
     values = jnp.stack([s[k] for k in which])
     out = jnp.zeros((), bool)
     for i in range(len(which)):
-        follow = inner[:, i] / jnp.where(first[i], inner[i, i], 1)  # dλ_l/ds_i
+        follow = inner[:, i] / select(first[i], inner[i, i], 1)  # dλ_l/ds_i
         for side in (1, -1):
             then = values + follow * (side - values[i])
             fine = jnp.ones((), bool)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool
 from ..._numerics._autodiff import frozen
 from ..._numerics._jaxpr import is_constant
 from ..._numerics._linalg import linear_solve
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._impact import impact
 from ...system._mode import ModeState, OFF, put
@@ -29,11 +30,11 @@ def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) ->
         out = switch.reset_fn(model.system, model.time(t), y)
         if switch.inverse_fn is not None:
             undone = switch.inverse_fn(model.system, model.time(t), y)
-            out = jax.tree.map(lambda a, b: jnp.where(model.direction > 0, a, b), out, undone)
+            out = jax.tree.map(lambda a, b: select(model.direction > 0, a, b), out, undone)
         return out, jax.tree.map(lambda a, b: jnp.abs(a) + jnp.abs(b), y, out)
     assert switch.restitution_fn is not None
     e = jnp.asarray(switch.restitution_fn(model.system), t.dtype)
-    e = jnp.where(model.direction > 0, e, 1 / e)
+    e = select(model.direction > 0, e, 1 / e)
     which = (k, *[j for j in model.contacts if j != k and k in model.contacts])
     takes_part = jnp.stack([jnp.ones((), bool)] + [state.mode[j] == 1 for j in which[1:]])
 
@@ -43,7 +44,7 @@ def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) ->
 
     def hit(s: tuple) -> tuple[Y, Y]:
         def push(j: int) -> Y:
-            unit = tuple(jnp.where(i == j, 1, 0).astype(t.dtype) for i in range(len(s)))
+            unit = tuple(select(i == j, 1, 0).astype(t.dtype) for i in range(len(s)))
             return jax.jvp(lambda s: model.field(t, y, s), (s,), (unit,))[1]
 
         pushes = [push(j) for j in which]
@@ -58,11 +59,11 @@ def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) ->
             # that there are no more rounds than contacts, a number that is known when the program is made.
             held = takes_part
             for _ in which[1:]:
-                square = jnp.where(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
-                p = linear_solve(square, jnp.where(held, want, 0))
+                square = select(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
+                p = linear_solve(square, select(held, want, 0))
                 held = held & ((p >= 0) | (jnp.arange(len(which)) == 0))  # no contact pulls
-            square = jnp.where(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
-            impulses = list(linear_solve(square, jnp.where(held, want, 0)))
+            square = select(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
+            impulses = list(linear_solve(square, select(held, want, 0)))
         out, size = y, jax.tree.map(jnp.abs, y)
         for p, direction in zip(impulses, pushes):
             out = jax.tree.map(lambda a, b, p=p: a + p * b, out, direction)
@@ -78,17 +79,17 @@ def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) ->
         if model.contact[j] == k:  # it is there for the instant of the impact
             (noise,) = model.rounding(lambda t, y, j=j: (model.level(j, t, y, state),), t, y)
             still = still | ((state.mode[j] == OFF) & (jnp.abs(begin) <= noise))
-            s = put(s, (j,), (jnp.where(state.mode[j] == OFF, jnp.where(still, 0, jnp.sign(begin)), s[j]),))
+            s = put(s, (j,), (select(state.mode[j] == OFF, select(still, 0, jnp.sign(begin)), s[j]),))
 
         def slip(sj: Scalar, j: int = j, s: tuple = s) -> Scalar:
             return model.level(j, t, hit(put(s, (j,), (sj,)))[0], state)
 
         # Where friction would reverse the sliding it ends it: the value that does so is found by one Newton step.
         end, slope = jax.jvp(slip, (s[j],), (jnp.ones_like(s[j]),))
-        stop = s[j] - end / jnp.where(slope == 0, 1, slope)
-        new = jnp.where(~still & (begin * end < 0) & (slope != 0) & (jnp.abs(stop) <= 1), stop, s[j])
+        stop = s[j] - end / select(slope == 0, 1, slope)
+        new = select(~still & (begin * end < 0) & (slope != 0) & (jnp.abs(stop) <= 1), stop, s[j])
         if model.contact[j] == k:  # what does not slide goes on so, as far as friction can keep it
-            new = jnp.where(still & (state.mode[j] == OFF) & (slope != 0), jnp.clip(stop, -1, 1), new)
+            new = select(still & (state.mode[j] == OFF) & (slope != 0), jnp.clip(stop, -1, 1), new)
         s = put(s, (j,), (new,))
     return hit(s)
 
@@ -139,17 +140,17 @@ def completed(
     stays = jnp.abs(h[part]) <= slack[part]
     least = 64 * eps * jnp.abs(speed) + slow(model, k, te, after, state_after)
     wrong = jnp.any(h < -slack) | (stays & (rise < -jnp.maximum(1e-9 * jnp.abs(speed), least)))
-    ratio = jnp.where(speed == 0, 0, -rise / jnp.where(speed == 0, 1, speed))
+    ratio = select(speed == 0, 0, -rise / select(speed == 0, 1, speed))
     rises = rise > least
     # Where the force is rounding too, rounding of dh/dt makes no flight.
-    flight = 2 * (rise - jnp.where(rises, 0, lax.stop_gradient(rise))) / jnp.where(pull < 0, -pull, 1)
+    flight = 2 * (rise - select(rises, 0, lax.stop_gradient(rise))) / select(pull < 0, -pull, 1)
     held = stays & ~rises & (jnp.abs(pull) <= blur)  # without any force
     possible = stays & ~wrong & ((pull < 0) | held) & (ratio < 1)
-    rest = jnp.where(possible, flight / (1 - jnp.where(possible, ratio, 0)), 0)
+    rest = select(possible, flight / (1 - select(possible, ratio, 0)), 0)
     drift = jax.tree.map(lambda x, f: x + rest * f, after, f)
     impulse = jax.tree.map(jnp.subtract, after, before)
     left, gain = jax.jvp(lambda y: rate(te, y), (drift,), (impulse,))
-    scale = jnp.where(gain == 0, 0, left / jnp.where(gain == 0, 1, gain))
+    scale = select(gain == 0, 0, left / select(gain == 0, 1, gain))
     rested = jax.tree.map(lambda x, d: x - scale * d, drift, impulse)
     low = 0.25 * flight * rise <= 1e3 * noise[part]
     return Completed(rises, flight, rest, rested, possible, low, stays, wrong)

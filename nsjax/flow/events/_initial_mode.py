@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool
 
 from ..._numerics._autodiff import frozen
 from ..._numerics._linalg import nearly
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._impact import impact
 from ...system._mode import ModeState, OFF
@@ -108,13 +109,13 @@ class _Start:
         if name in self.given:
             mode = jnp.asarray(self.given[name], jnp.int32)
             if self.model.conditional(k):  # whether its contact is closed is seen later
-                mode = jnp.where(mode == OFF, jnp.where(jnp.abs(h) <= noise, 0, jnp.sign(h)).astype(jnp.int32), mode)
+                mode = select(mode == OFF, select(jnp.abs(h) <= noise, 0, jnp.sign(h)).astype(jnp.int32), mode)
             # A state taken from an earlier solution may carry some drift off its surface.
-            self.beyond[k] = jnp.where(mode == 0, jnp.abs(h), -mode.astype(h.dtype) * h) - 1e6 * noise
+            self.beyond[k] = select(mode == 0, jnp.abs(h), -mode.astype(h.dtype) * h) - 1e6 * noise
             self.chosen.append(k)
             self.on[k] = mode.astype(h.dtype) * h <= noise
         else:
-            mode = jnp.where(self.on[k], 0, jnp.sign(h)).astype(jnp.int32)
+            mode = select(self.on[k], 0, jnp.sign(h)).astype(jnp.int32)
         self.at[k] = self.on[k]
         self.put(mode, part)
 
@@ -129,7 +130,7 @@ class _Start:
             h = model.least(k, t, y)
             near = jnp.abs(h) <= instant * jnp.abs(frozen(model.approach(k, t, y, state, f)))
             self.on[k] = self.at[k] = self.on[k] | near
-            self.modes[k] = jnp.where(self.on[k], 0, self.modes[k])
+            self.modes[k] = select(self.on[k], 0, self.modes[k])
 
     def refuse_wrong_modes(self) -> None:
         model, t, y, state = self.model, self.t, self.y, self.state()
@@ -153,16 +154,16 @@ class _Start:
         f = model.flow(t, y, state)
         for k, value in enumerate(frozen(model.values(t, y, state))):
             if model.static(k) and k in model.holdable:
-                edge = jnp.where(model.direction < 0, model.edge(k, value, nearly(t)), 0)
-                roots[k] = jnp.where((state.mode[k] == 0) & ((k in self.chosen) | ~self.at[k]), edge, roots[k])
+                edge = select(model.direction < 0, model.edge(k, value, nearly(t)), 0)
+                roots[k] = select((state.mode[k] == 0) & ((k in self.chosen) | ~self.at[k]), edge, roots[k])
         for k, here in self.on.items():
             rate = model.approach(k, t, y, state, f)
             sign = 1 - state.mode[k] if isinstance(model.switches[k], impact) else state.mode[k]
             part = 0 if state.part[k] is None else state.part[k]
             size = model.sizes(lambda t, y, k=k: model.h(k, t, y), t, y, jnp.ones_like(t), f)[part]
-            fresh = jnp.where(jnp.abs(rate) > jnp.sqrt(jnp.finfo(t.dtype).eps) * size, 1, 2)
+            fresh = select(jnp.abs(rate) > jnp.sqrt(jnp.finfo(t.dtype).eps) * size, 1, 2)
             if model.conditional(k):
-                sign = jnp.where(sign == OFF, 0, sign)
+                sign = select(sign == OFF, 0, sign)
             settled = jnp.zeros((), bool) if k in self.chosen else self.at.get(k, jnp.zeros((), bool))
-            roots[k] = jnp.where(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
+            roots[k] = select(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
         return roots

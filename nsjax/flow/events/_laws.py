@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from ..._numerics._linalg import nearly
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
@@ -65,8 +66,8 @@ class Instant(NamedTuple):
     def side(self, k: int, slope: Scalar) -> Int[Array, ""]:
         """To which side one goes that leaves its surface: where both fields point beyond |λ| = 1, from a surface that
         repels to the other side."""
-        alone = jnp.where(slope >= 0, -self.leaves[k], self.leaves[k])
-        return jnp.where(self.pushed[k] == 0, alone, self.pushed[k]) if k in self.pushed else alone
+        alone = select(slope >= 0, -self.leaves[k], self.leaves[k])
+        return select(self.pushed[k] == 0, alone, self.pushed[k]) if k in self.pushed else alone
 
     def fresh(self, k: int) -> Bool[Array, ""] | bool:
         """Whether it comes to its surface only now."""
@@ -133,7 +134,7 @@ def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Ver
     yes, rank = jnp.ones((), bool), jnp.zeros((), jnp.int32)
     mode = dict(trial)
     for i, k in enumerate(which):
-        mode[k] = jnp.where(at[k], row[i], trial[k]).astype(jnp.int32)
+        mode[k] = select(at[k], row[i], trial[k]).astype(jnp.int32)
     seen = here.look(mode)
     s, rates, slopes, spans = seen
     valid, sound, clear, repelled = yes, yes, yes, ~yes
@@ -142,7 +143,7 @@ def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Ver
         if k in model.contacts:
             held = row[i] == 1
             stays = (s[k] * slopes[k] >= -noise[k]) & (leaves[k] == 0)
-            law = strict = jnp.where(held, stays, (rates[k] > noise[k]) | (leaves[k] != 0))
+            law = strict = select(held, stays, (rates[k] > noise[k]) | (leaves[k] != 0))
         elif k in model.holdable:
             held = row[i] == 0
             small = nearly(t) * jnp.abs(slopes[k])
@@ -156,28 +157,28 @@ def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Ver
             # stays there: held, it would be let go again at the same instant.
             left = (came[k] != 0) & (s[k] * came[k].astype(t.dtype) >= (1 - nearly(t)) * bound)
             sticks = (jnp.abs(s[k]) <= (1 + nearly(t)) * bound) & (leaves[k] == 0) & ~left
-            law = jnp.where(held, sticks, jnp.where(leaves[k] == 0, goes, forced))
+            law = select(held, sticks, select(leaves[k] == 0, goes, forced))
             strict = law & (held | (leaves[k] != 0) | (opening > small))
             if model.conditional(k):  # what is not there has no choice: its first option stands for that
                 absent = here.absent(k, mode)
-                law, strict = (jnp.where(absent, held, x) for x in (law, strict))
+                law, strict = (select(absent, held, x) for x in (law, strict))
                 held, crosses = held & ~absent, crosses & ~absent
             # Repulsion is no law, but a preference: a surface that repels may hold what has been on it so far, (2.25).
             repels = (slopes[k] >= 0) & (came[k] != 0) & ~here.grips(k, s[k])
             repelled = repelled | (at[k] & held & repels)
         else:
             turns = (leaves[k] != 0) & (came[k] != 0)  # it can only cross
-            unmoved = jnp.where(came[k] == 0, 1, came[k])
-            onward = jnp.where(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
-            law = row[i] == jnp.where(turns, -came[k], onward)
-            strict = law = jnp.where(here.absent(k, mode), row[i] == 1, law) if model.conditional(k) else law
+            unmoved = select(came[k] == 0, 1, came[k])
+            onward = select(rates[k] == 0, unmoved, jnp.sign(rates[k]).astype(jnp.int32))
+            law = row[i] == select(turns, -came[k], onward)
+            strict = law = select(here.absent(k, mode), row[i] == 1, law) if model.conditional(k) else law
         valid = valid & (~at[k] | (row[i] == came[k] if k in (here.given or ()) else law))
         sound, clear = sound & (~at[k] | law), clear & (~at[k] | strict)
         kept = held & (model.held(k, came[k]) if k in model.holdable else False)
         # Powers of five: of up to four switches, no number of lesser preferences outweighs a greater one. To hold is
         # preferred because friction does so while it can; of several that hold as many, the one that goes on as before.
         for weight, better in ((25, held), (5, kept), (1, crosses)):
-            rank = rank + jnp.where(at[k] & better, weight, 0)
+            rank = rank + select(at[k] & better, weight, 0)
     for (i, j), (same, ratio) in here.pairs.items():
         k, other = model.holdable[i], model.holdable[j]
         for each in filter(model.conditional, (k, other)):  # what is not there shares no surface
@@ -188,4 +189,4 @@ def judge(here: Instant, trial: dict, noise: dict, row: Int[Array, " m"]) -> Ver
         still = negligible(rates[k], spans[k]) & negligible(rates[other], spans[other])
         one = one & (still | ~(model.held(k, a) & model.held(other, b)))
         valid, sound, clear = valid & one, sound & one, clear & one
-    return Verdict(valid, sound, clear, (rank + jnp.where(repelled, 0, 125)).astype(jnp.int32), seen)
+    return Verdict(valid, sound, clear, (rank + select(repelled, 0, 125)).astype(jnp.int32), seen)

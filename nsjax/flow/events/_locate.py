@@ -15,6 +15,7 @@ from ..._numerics._barrier import once
 from ..._numerics._bernstein import at, deflate, falls, first_roots, largest, lowest
 from ..._numerics._jaxpr import dependence
 from ..._numerics._linalg import coloured
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
@@ -81,7 +82,7 @@ def _arrival_jvp(primals: Any, tangents: Any) -> tuple[tuple[Scalar, Y], tuple[S
     change = jnp.zeros_like(te) if change is None else change
     f = model.flow(te, y_end, state)
     slope = jax.jvp(lambda t, y: _guard(t, y, args), (te, y_end), (jnp.ones_like(te), f))[1]
-    shift = -change / jnp.where(found, slope, 1)
+    shift = -change / select(found, slope, 1)
     return (te, y_end), (shift, jax.tree.map(lambda d, f: d + f * shift, moved, f))
 
 
@@ -99,7 +100,7 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
     single = single & (known[:, 0] == 0)
     first = jnp.arange(known.shape[1]) == 0
     near = (once(lowest(polynomials) - NEAR * largest(polynomials)) < 0) & single[:, None]
-    lows = [jnp.where(first, jnp.where(near, x, 1.0), -1.0) for x in falls(polynomials)]
+    lows = [select(first, select(near, x, 1.0), -1.0) for x in falls(polynomials)]
     both = [jnp.concatenate(pair) for pair in zip(deflate(polynomials, known), lows)]
     (found, turns), (root, low) = (jnp.split(x, 2) for x in first_roots(both))
     turns = turns & (low > 0) & single
@@ -116,13 +117,13 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
     # above rounding on the whole step.
     least = jnp.asarray([0 if slot.holding else 2 for slot in model.slots], known.dtype)[:, None]
     found = found & ~jnp.any((once(largest(polynomials)) <= noise) & (known >= least), axis=-1)
-    root = jnp.where(found, root, jnp.inf)
+    root = select(found, root, jnp.inf)
     earliest = jnp.min(root)
     length = lax.stop_gradient(t_next) - start
     met = jnp.any(found)
-    dips = jnp.where(turns & (low < earliest), at(polynomials, low)[:, 0], jnp.inf)
+    dips = select(turns & (low < earliest), at(polynomials, low)[:, 0], jnp.inf)
     nearest = jnp.argmin(dips / once(largest(polynomials))[:, 0])
-    guess = start + jnp.where(met, jnp.minimum(earliest, 1), jnp.where(turns[nearest], low[nearest], 1)) * length
+    guess = start + select(met, jnp.minimum(earliest, 1), select(turns[nearest], low[nearest], 1)) * length
 
     y_guess = stepper(frozen_model, state, start, guess, y_start, f_start).y1
     f = flow(guess, y_guess)
@@ -131,24 +132,24 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
     part = jnp.argmax(values, axis=-1)
     value = jnp.take_along_axis(values, part[:, None], axis=-1)[:, 0]
     rate = jnp.take_along_axis(rates, part[:, None], axis=-1)[:, 0]
-    shift = -value / jnp.where(rate == 0, 1, rate)
+    shift = -value / select(rate == 0, 1, rate)
     # Finite where no root was found, too: in reverse mode what is not used is multiplied by zero, and inf - inf is NaN.
-    plain = jnp.where(found, root - earliest, 0) * length
+    plain = select(found, root - earliest, 0) * length
     # The dense output is nearly right: a Newton step that rises, or is long, belongs to a tangency or to another root,
     # and the root of the polynomial stands. So does a root more than 1e-4 of the step after the first one, where the
     # field at the first one says little.
     trusted = (rate < 0) & (jnp.abs(shift) <= 1e-2 * length) & (plain <= 1e-4 * length)
-    shift = jnp.where(trusted, shift, plain)
+    shift = select(trusted, shift, plain)
     # Of events at one instant the first in the order of declaration: as long as no guard has fallen below its rounding.
-    blur = jnp.take_along_axis(noise, part[:, None], axis=-1)[:, 0] / jnp.where(rate == 0, 1, jnp.abs(rate))
-    latest = jnp.min(jnp.where(found, shift + jnp.where(trusted, blur, 0), jnp.inf))
-    slot = jnp.where(met, jnp.argmax(found & (shift <= latest)), nearest).astype(jnp.int32)
+    blur = jnp.take_along_axis(noise, part[:, None], axis=-1)[:, 0] / select(rate == 0, 1, jnp.abs(rate))
+    latest = jnp.min(select(found, shift + select(trusted, blur, 0), jnp.inf))
+    slot = select(met, jnp.argmax(found & (shift <= latest)), nearest).astype(jnp.int32)
     # The dense output tells how near each comes; without an event the step was taken again to the nearest of them.
-    missed = jnp.where(~met & (jnp.arange(len(dips)) == nearest) & (dips < jnp.inf), value, dips)
+    missed = select(~met & (jnp.arange(len(dips)) == nearest) & (dips < jnp.inf), value, dips)
     if model.clocks:  # at a tick a guard may jump away from zero as it comes to it
         ticks = met & jnp.asarray([k in model.clocks for k, _, _ in model.slots])[slot]
         falls_on = ticks & single & (value > 0) & (rate < 0)
-        missed = jnp.where(falls_on, jnp.minimum(missed, value), missed)
+        missed = select(falls_on, jnp.minimum(missed, value), missed)
     te = jnp.clip(guess + shift[slot], start, start + length)
     dt = te - guess
     bend = jax.jvp(flow, (guess, y_guess), (one, f))[1]
@@ -156,7 +157,7 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
     te, y_end = _arrival(te, y_end, stepper, (*args, slot, part[slot], met))
     # At the very start of the step the event is a consequence of the one before: it has the same time and derivative.
     at_once = jnp.isfinite(root[slot]) & (root[slot] <= 0)
-    te, y_end = jax.tree.map(lambda a, b: jnp.where(at_once, a, b), (t, y), (te, y_end))
+    te, y_end = jax.tree.map(lambda a, b: select(at_once, a, b), (t, y), (te, y_end))
     return Located(met, te, y_end, slot, part, missed)
 
 
@@ -206,7 +207,7 @@ def transversality(
         return jax.jvp(guards, (t, flat), (dt, dx))[1]
 
     h_t, n = moved(jnp.ones_like(t), jnp.zeros_like(flat)), jax.vmap(moved, (None, 0), 1)(jnp.zeros_like(t), seeds)
-    n, near = jnp.where(table < 0, 0, n), jnp.maximum(table, 0)
+    n, near = select(table < 0, 0, n), jnp.maximum(table, 0)
     # (Sums of a few columns, written out: XLA's products of so short rows take ten times as long.)
     zero, columns = jnp.zeros_like(h_t), list(zip(n.T, f[near].T, error[near].T))
     square, along = sum((n * n for n, _, _ in columns), zero), sum((n * f for n, f, _ in columns), zero)
@@ -220,5 +221,5 @@ def cosine(h_t: Scalar, n: Float[Array, " n"], f: Float[Array, " n"]) -> Scalar:
 
 def _cosine(h_t: Scalar, square: Scalar, along: Scalar, speed: Scalar) -> Scalar:
     """From |n|², n·f and |f|²."""
-    size = (square + h_t**2) * (speed + jnp.where(h_t == 0, 0, 1))
+    size = (square + h_t**2) * (speed + select(h_t == 0, 0, 1))
     return jnp.abs(along + h_t) / jnp.sqrt(size)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Int
 
 from ..._numerics._autodiff import frozen
 from ..._numerics._linalg import nearly
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
@@ -63,13 +64,13 @@ def settle(
     trial = dict(mode)
     for k in which:
         if k in model.contacts:
-            trial[k] = jnp.where(at[k], jnp.where(leaves[k] != 0, 0, 1), mode[k])
+            trial[k] = select(at[k], select(leaves[k] != 0, 0, 1), mode[k])
         elif k in model.holdable:
-            trial[k] = jnp.where(at[k], 0, mode[k])
+            trial[k] = select(at[k], 0, mode[k])
     if model.pairs:
         here = _together(here, trial)
         for k in filter(here.dry, which):
-            trial[k] = jnp.where(here.at[k], 0, trial[k])
+            trial[k] = select(here.at[k], 0, trial[k])
     alone = [k for k in which if model.apart[k]]
     parts = [_alone(here.only(alone), trial)] if alone else []
     if len(alone) < len(which):
@@ -129,12 +130,12 @@ def _entered(
     for k in here.which:
         if k in model.contacts:
             # It lifts off with h = dh/dt = 0, and where its force has reached zero d²h/dt² = 0 too.
-            fresh = jnp.where(leaves[k] != 0, 3, 2)
-            edge = jnp.where(jnp.abs(s[k] * slopes[k]) <= noise[k], 1, 0)
+            fresh = select(leaves[k] != 0, 3, 2)
+            edge = select(jnp.abs(s[k] * slopes[k]) <= noise[k], 1, 0)
         else:
             # Leaving with dh/dt = 0 (the end of sliding with b = 1) makes a double root of h at this instant.
             simple = rates[k] * trial[k].astype(t.dtype) > 1e-10 * jnp.abs(slopes[k])
-            fresh = jnp.where(simple, 1, 2)
+            fresh = select(simple, 1, 2)
             edge = jnp.zeros((), jnp.int32)
             if k in model.holdable:
                 # What begins to be held with λ at its bound need not leave: where λ goes decides.
@@ -142,10 +143,10 @@ def _entered(
             if here.starts:
                 unsure = unsure | (here.open(k) & (trial[k] == 0) & (slopes[k] > 0) & others[k])
         held = model.held(k, trial[k]) if k in model.holdable else False
-        known = jnp.where(held, edge, fresh)
+        known = select(held, edge, fresh)
         if model.conditional(k):
-            known = jnp.where(here.absent(k, trial), 0, known)
-        roots[k] = jnp.where(here.open(k), known, roots[k]).astype(jnp.int32)
+            known = select(here.absent(k, trial), 0, known)
+        roots[k] = select(here.open(k), known, roots[k]).astype(jnp.int32)
     mode = tuple(m.astype(jnp.int32) for m in trial.values())
     return here.state._replace(mode=mode, roots=tuple(roots)), unsure
 
@@ -160,12 +161,12 @@ def _together(here: Instant, trial: dict[int, Any]) -> Instant:
         part = 0
         if parts[k] is not None:
             # What is off its surface is nearest to it with the least component.
-            part = jnp.where(at[k], parts[k], jnp.argmin(values).astype(jnp.int32))
+            part = select(at[k], parts[k], jnp.argmin(values).astype(jnp.int32))
             parts[k] = part
         h[i] = values[part], blur[part]
     here = here._replace(state=state._replace(part=tuple(parts)))
     first, s = here.values(trial)
-    s = tuple(jnp.where(jnp.isfinite(v), v, 0) for v in s)
+    s = tuple(select(jnp.isfinite(v), v, 0) for v in s)
     rates, matrix = model.linear(t, y, first, s)
     pairs, size = coinciding(model, rates, matrix), reach(model, matrix)
     pushed = {model.holdable[i]: jnp.zeros((), jnp.int32) for i in h}
@@ -178,13 +179,13 @@ def _together(here: Instant, trial: dict[int, Any]) -> Instant:
         both = same & at[k] & at[other]
         pairs[i, j] = both, pairs[i, j][1]
         # Their values reach the bounds together, each in the direction in which it resists.
-        turn = jnp.where((matrix[i, i] < 0) == (matrix[i, j] < 0), 1, -1)
+        turn = select((matrix[i, i] < 0) == (matrix[i, j] < 0), 1, -1)
         for a, b in ((k, other), (other, k)):
             follows = both & (leaves[b] == 0) & (here.came[b] == 0)
-            leaves[b] = jnp.where(follows, turn * leaves[a], leaves[b]).astype(jnp.int32)
+            leaves[b] = select(follows, turn * leaves[a], leaves[b]).astype(jnp.int32)
         for n, a in ((i, k), (j, other)):
-            push = jnp.where(matrix[n, n] < 0, leaves[a], -leaves[a])
-            pushed[a] = jnp.where(both, push, pushed[a])
+            push = select(matrix[n, n] < 0, leaves[a], -leaves[a])
+            pushed[a] = select(both, push, pushed[a])
     return here._replace(at=at, leaves=leaves, pairs=pairs, pushed=pushed)
 
 
@@ -213,11 +214,11 @@ def _assignments(here: Instant) -> tuple[Int[Array, "rows m"], Bool[Array, " row
     # Of a model with more, each row says which option the first that is at its surface has, the second, and so on.
     codes = np.array(list(itertools.product(range(3), repeat=_TRIED)), np.int32)
     turn = jnp.cumsum(at, dtype=jnp.int32) - 1
-    code = sum(jnp.where(at & (turn == i), codes[:, i : i + 1], 0) for i in range(_TRIED))
+    code = sum(select(at & (turn == i), codes[:, i : i + 1], 0) for i in range(_TRIED))
     real = jnp.all(code < np.array([len(o) for o in options], np.int32), axis=1)
     real = real & jnp.all((np.arange(_TRIED, dtype=np.int32) <= turn[-1]) | (codes == 0), axis=1)
     first, second, third = np.array([(*o, 0)[:3] for o in options], np.int32).T
-    return jnp.where(code == 0, first, jnp.where(code == 1, second, third)), real
+    return select(code == 0, first, select(code == 1, second, third)), real
 
 
 def _jointly(here: Instant, trial: dict) -> _Choice:
@@ -229,7 +230,7 @@ def _jointly(here: Instant, trial: dict) -> _Choice:
     if held is not None and crowded:
         # Both are worked out: with a `cond` between them batches of such models came to a standstill.
         more = sum(here.at[k].astype(jnp.int32) for k in which) > _TRIED
-        found = jax.tree.map(ft.partial(jnp.where, more), _search(here, trial, held, noise, more), found)
+        found = jax.tree.map(ft.partial(select, more), _search(here, trial, held, noise, more), found)
     trial, seen, others, wrong = found
     return _Choice(trial, seen, dict(zip(which, others)), wrong, noise)
 
@@ -240,12 +241,12 @@ def _best(here: Instant, trial: dict, noise: dict) -> tuple[dict, Outcome, Bool[
     which = here.which
     table, real = _assignments(here)
     found = jax.vmap(ft.partial(judge, here, trial, noise))(table)
-    score = jnp.where(found.valid & real, found.rank, -1)
+    score = select(found.valid & real, found.rank, -1)
     best = jnp.argmax(score)
     seen = jax.tree.map(lambda x: x[best], found.seen)
     # Where no assignment is valid, all scores are -1: a tie too, and so an open choice.
     others = _elsewhere(here, table[best], seen, table, found.sound[best] & found.clear & real)
-    out = {k: jnp.where(here.at[k], table[best, i], trial[k]).astype(jnp.int32) for i, k in enumerate(which)}
+    out = {k: select(here.at[k], table[best, i], trial[k]).astype(jnp.int32) for i, k in enumerate(which)}
     return trial | out, seen, others, jnp.sum(score == score[best]) != 1
 
 
@@ -258,13 +259,13 @@ def _guess(here: Instant, trial: dict, seen: Outcome) -> dict:
         elif here.dry(k):
             side, repels = here.side(k, seen.slopes[k]), seen.slopes[k] >= 0
             passes = repels & (came[k] != 0) & ~here.grips(k, seen.s[k])
-            out[k] = jnp.where(at[k] & (side != 0), side, jnp.where(at[k] & passes, -came[k], trial[k]))
+            out[k] = select(at[k] & (side != 0), side, select(at[k] & passes, -came[k], trial[k]))
         elif k not in model.contacts:
-            unmoved = jnp.where(came[k] == 0, 1, came[k])
-            side = jnp.where(seen.rates[k] == 0, unmoved, jnp.sign(seen.rates[k]).astype(jnp.int32))
+            unmoved = select(came[k] == 0, 1, came[k])
+            side = select(seen.rates[k] == 0, unmoved, jnp.sign(seen.rates[k]).astype(jnp.int32))
             # It cannot but cross; at a double root the sign of dh/dt is rounding.
-            side = jnp.where((leaves[k] != 0) & (came[k] != 0), -came[k], side)
-            out[k] = jnp.where(at[k], side, came[k])
+            side = select((leaves[k] != 0) & (came[k] != 0), -came[k], side)
+            out[k] = select(at[k], side, came[k])
     return out
 
 
@@ -298,8 +299,8 @@ def _left_together(here: Instant, trial: dict, seen: Outcome) -> tuple[Instant, 
             over = seen.s[k] * came.astype(here.t.dtype) / here.model.bound(k) - 1
             tied = here.open(k) & (came != 0) & (seen.slopes[k] < 0) & (leaves[k] == 0)
             tied = tied & (jnp.abs(over) <= nearly(over))
-            leaves[k] = jnp.where(tied, came, leaves[k])
-            trial[k] = jnp.where(tied, came, trial[k])
+            leaves[k] = select(tied, came, leaves[k])
+            trial[k] = select(tied, came, trial[k])
     return here._replace(leaves=leaves), trial
 
 
@@ -333,7 +334,7 @@ def _search(
                 a, b = (here.model.holdable[n] for n in pair)
                 if k in (a, b):
                     n = which.index(b if k == a else a)
-                    row[n] = jnp.where(same, ratio.astype(jnp.int32) * value, row[n])
+                    row[n] = select(same, ratio.astype(jnp.int32) * value, row[n])
             table.append(jnp.stack(row))
     table = jnp.stack(table) if table else chosen[None]
     clear = jax.vmap(ft.partial(judge, here, trial, noise))(table).clear
@@ -353,12 +354,12 @@ def _pinned(here: Instant, trial: dict, rates: dict) -> dict:
         if k in model.contacts:
             continue
         pull = sum(
-            jnp.where(here.at[c] & (trial[c] == 1), jnp.abs(matrix[i, j] * s[c]), 0)
+            select(here.at[c] & (trial[c] == 1), jnp.abs(matrix[i, j] * s[c]), 0)
             for j, c in enumerate(model.holdable)
             if c in model.contacts
         )
         pinned = here.open(k) & (here.leaves[k] == 0) & (pull > 0) & (jnp.abs(rates[k]) <= 1e-10 * pull)
-        out[k] = jnp.where(pinned, 0, trial[k]).astype(jnp.int32)
+        out[k] = select(pinned, 0, trial[k]).astype(jnp.int32)
     return out
 
 
@@ -376,31 +377,31 @@ def _amend(here: Instant, trial: dict, seen: Outcome, noise: dict, apart: bool =
         else:
             over = jnp.abs(s[k]) / (model.bound(k) if k in model.holdable else 1) - (1 + slack)
             against = -rates[k] * trial[k].astype(rates[k].dtype)
-        excess.append(jnp.where(held, over, -1))
+        excess.append(select(held, over, -1))
         # What has just left has its λ at the bound (or it crosses): dh/dt may be zero apart from rounding.
         free = here.open(k) & ~here.absent(k, trial) if model.conditional(k) else here.open(k)
         free = free & ~held & (trial[k] != 0 if k not in model.contacts else True) & (here.leaves[k] == 0)
-        opposed.append(jnp.where(free & (against > 1e-10 * jnp.abs(slopes[k])), against, 0))
+        opposed.append(select(free & (against > 1e-10 * jnp.abs(slopes[k])), against, 0))
     # (A multiplier that is NaN is a violation too.)
     released = [~(over <= 0) for over in excess]
     retaken = [(against > 0) & ~over for against, over in zip(opposed, released)]
     if not apart:
         worst, back = jnp.stack(excess), jnp.stack(opposed)
         release, index = jnp.any(~(worst <= 0)), np.arange(len(which))
-        released = list(release & (jnp.argmax(jnp.where(jnp.isnan(worst), jnp.inf, worst)) == index))
+        released = list(release & (jnp.argmax(select(jnp.isnan(worst), jnp.inf, worst)) == index))
         retaken = list(~release & jnp.any(back > 0) & (jnp.argmax(back) == index))
     out = dict(trial)
     for k, first, again in zip(which, released, retaken):
         if k in model.contacts:
             side, taken = 0, 1
         else:
-            taken = jnp.where(slopes[k] < 0, 0, -trial[k])
-            side = jnp.where((s[k] >= 0) == (slopes[k] < 0), 1, -1)  # where dh/dt = slope (s - λ) points
-        out[k] = jnp.where(first, side, jnp.where(again, taken, trial[k])).astype(jnp.int32)
+            taken = select(slopes[k] < 0, 0, -trial[k])
+            side = select((s[k] >= 0) == (slopes[k] < 0), 1, -1)  # where dh/dt = slope (s - λ) points
+        out[k] = select(first, side, select(again, taken, trial[k])).astype(jnp.int32)
     # Surfaces that coincide are left and held together.
     moved = dict(out)
     for (i, j), (same, ratio) in here.pairs.items():
         for k, other in ((model.holdable[i], model.holdable[j]), (model.holdable[j], model.holdable[i])):
             follows = same & (out[k] != trial[k]) & here.open(other)
-            moved[other] = jnp.where(follows, ratio.astype(jnp.int32) * out[k], moved[other]).astype(jnp.int32)
+            moved[other] = select(follows, ratio.astype(jnp.int32) * out[k], moved[other]).astype(jnp.int32)
     return moved, ft.reduce(jnp.logical_or, [*released, *retaken])

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._numerics._bernstein import bend
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._clock import clock
 from ...system._impact import impact
@@ -79,13 +80,13 @@ def transition(
     cosines, slack = transversality(model, t, event.before, step.state, part, tolerance, seen)
     cosine, missed = cosines[slot], event.missed
     if event.ticks is not None:
-        cosine = jnp.where(event.ticks, 1, cosine)
-        missed = jnp.minimum(missed, jnp.where(event.ticks, event.jumped_to(state, after), jnp.inf))
+        cosine = select(event.ticks, 1, cosine)
+        missed = jnp.minimum(missed, select(event.ticks, event.jumped_to(state, after), jnp.inf))
     # At a cosine c an error δ of h changes c by about δ/c, and the saltation matrix, which grows as 1/c, by δ/c² of
     # itself. With δ = eps that is as much as c where c is the cube root of eps. A short flight ends with a small cosine
     # as well, but there h has no minimum, and the derivatives are right.
     rows = [a[slot, part[slot]] for a in step.polynomials]
-    bends = bend(rows, (t - step.t) / jnp.where(halted, 1, step.t_next - step.t)) > 0
+    bends = bend(rows, (t - step.t) / select(halted, 1, step.t_next - step.t)) > 0
     grazes = event.found & news & ~halted & bends & (cosine < jnp.cbrt(jnp.finfo(t.dtype).eps))
     points = None
     if record is not None:
@@ -103,11 +104,11 @@ def transition(
         slot=slot,
         news=news,
         points=points,
-        transversality=jnp.where(grazes, 0, cosine),  # as it counts from here on
+        transversality=select(grazes, 0, cosine),  # as it counts from here on
         grazes=grazes,
         forked=forked,
         result=event.result,
-        margin=jnp.min(jnp.where(missed < jnp.inf, missed / slack, jnp.inf)),
+        margin=jnp.min(select(missed < jnp.inf, missed / slack, jnp.inf)),
     )
 
 
@@ -122,13 +123,13 @@ class _Event:
         self.state = state = step.state
         self.ticks = jnp.asarray([s.switch in model.clocks for s in model.slots])[self.slot] if model.clocks else None
         if self.ticks is not None:  # to the last digit
-            self.t = self.t + lax.stop_gradient(jnp.where(self.ticks, model.next_tick(state.mode) - self.t, 0))
+            self.t = self.t + lax.stop_gradient(select(self.ticks, model.next_tick(state.mode) - self.t, 0))
         # What leaves a surface must do so from there: from beside it, at a loose tolerance, it met the surface again at
         # once, and chattered.
         self.before = model.project(self.t, before, state) if model.holdable else before
         self.halted = self.t <= step.t
         self.parts, self.modes = list(state.part), list(state.mode)
-        self.roots = [jnp.where(self.halted, r, 0) for r in state.roots]
+        self.roots = [select(self.halted, r, 0) for r in state.roots]
         self.after, self.size = self.before, jax.tree.map(jnp.abs, self.before)
         self.t_after = self.t
         self.at: dict[int, Bool[Array, ""]] = {}
@@ -147,38 +148,38 @@ class _Event:
         for i, (k, number, holding) in enumerate(self.model.slots):
             now = self.slot == i
             if holding:
-                self.bounds[k] = jnp.where(now, number, self.bounds[k])
+                self.bounds[k] = select(now, number, self.bounds[k])
                 continue
             self.fired[k] = self.fired[k] | now
             if self.parts[k] is not None:
                 mode = self.state.mode[k]
                 if isinstance(self.model.switches[k], sgn):
                     self.tip[k] = self.tip[k] | (now & (mode == 0))
-                self.parts[k] = jnp.where(now, jnp.where(mode < 0, component, number), self.parts[k])
+                self.parts[k] = select(now, select(mode < 0, component, number), self.parts[k])
 
     def jump(self) -> None:
         """The modes of relays and clocks, and the states after impacts."""
         model, t, before, modes = self.model, self.t, self.before, self.modes
         for k, switch in enumerate(model.switches):
             if isinstance(switch, (relay, clock)):
-                modes[k] = jnp.where(self.fired[k], switch.next_mode(modes[k], model.direction), modes[k])
+                modes[k] = select(self.fired[k], switch.next_mode(modes[k], model.direction), modes[k])
             elif isinstance(switch, impact):
                 touching = self.state._replace(part=tuple(self.parts))
                 # Another impact at this instant may have opened it: then h < 0 is rounding.
                 opens = self.fired[k] & (model.approach(k, t, before, touching) > slow(model, k, t, before, touching))
-                self.roots[k] = jnp.where(opens, 1, self.roots[k])
+                self.roots[k] = select(opens, 1, self.roots[k])
                 self.fired[k] = now = self.fired[k] & ~opens
                 hit = rebound(model, k, t, before, touching)
                 now_and_then = hit, (self.after, self.size)
-                self.after, self.size = jax.tree.map(lambda a, b, now=now: jnp.where(now, a, b), *now_and_then)
+                self.after, self.size = jax.tree.map(lambda a, b, now=now: select(now, a, b), *now_and_then)
 
     def meet(self, k: int) -> None:
         """Whether a `sgn` switch is at its surface, and if an impact or a tick took it off, on which side it is."""
         model, later, t, roots, tip = self.model, self.later, self.t, self.roots, self.tip[k]
         # The end of a surface at its tip leads into h < 0.
-        mode = jnp.where(tip, -1, self.modes[k])
+        mode = select(tip, -1, self.modes[k])
         here = ((self.state.mode[k] == 0) | self.fired[k] | (self.halted & (roots[k] > 0))) & ~tip
-        roots[k] = jnp.where(tip, 1, roots[k])
+        roots[k] = select(tip, 1, roots[k])
         if model.of_kind(impact) or model.clocks:
             # An impact may carry the state across the surface, or off it, and a tick the surface across the state: the
             # switch follows at once.
@@ -189,22 +190,22 @@ class _Event:
                 shift, still = 2 * (model.margin(t) + later.margin(t)), jax.tree.map(jnp.zeros_like, self.after)
                 slack += jnp.max(later.sizes(lambda t, y: later.h(k, t, y), t, self.after, shift, still))
             moved, off = jnp.abs(h1 - h0) > slack, jnp.abs(h1) > slack
-            mode = jnp.where(moved & off, jnp.sign(h1).astype(jnp.int32), mode)
-            roots[k] = jnp.where(moved, 0, roots[k])
-            here = jnp.where(moved, ~off, here)
+            mode = select(moved & off, jnp.sign(h1).astype(jnp.int32), mode)
+            roots[k] = select(moved, 0, roots[k])
+            here = select(moved, ~off, here)
             if model.clocks and self.parts[k] is not None:
                 nearest = jnp.argmin(jnp.stack(later.h(k, t, self.after))).astype(jnp.int32)
-                self.parts[k] = jnp.where(moved, nearest, self.parts[k])
+                self.parts[k] = select(moved, nearest, self.parts[k])
         if model.conditional(k):
             # Where its contact closes it is met anew; where that stays open, the mode that it would have is dropped.
             anew = self.state.mode[k] == OFF
             h = jnp.stack(later.h(k, t, self.after))
             slack, part = later.rounding(lambda t, y: later.h(k, t, y), t, self.after, self.size), jnp.argmin(h)
             on = jnp.abs(h[part]) <= slack[part]
-            mode = jnp.where(anew, jnp.where(on, 0, jnp.sign(h[part])).astype(jnp.int32), mode)
-            roots[k], here = jnp.where(anew, 0, roots[k]), jnp.where(anew, on, here)
+            mode = select(anew, select(on, 0, jnp.sign(h[part])).astype(jnp.int32), mode)
+            roots[k], here = select(anew, 0, roots[k]), select(anew, on, here)
             if self.parts[k] is not None:
-                self.parts[k] = jnp.where(anew, part.astype(jnp.int32), self.parts[k])
+                self.parts[k] = select(anew, part.astype(jnp.int32), self.parts[k])
         self.modes[k], self.at[k] = mode, here
 
     def open_at_tick(self, k: int) -> None:
@@ -215,7 +216,7 @@ class _Event:
         gaps = jnp.stack(later.h(k, t, after))
         slack = 1e4 * later.rounding(lambda t, y: later.h(k, t, y), t, after, self.size)
         self.result = RESULTS.where(self.ticks & jnp.any(gaps < -slack), RESULTS.jump_penetrates, self.result)
-        self.modes[k] = jnp.where(self.ticks & jnp.all(gaps > slack), 0, self.modes[k])
+        self.modes[k] = select(self.ticks & jnp.all(gaps > slack), 0, self.modes[k])
 
     def come_to_rest(self) -> None:
         """Whether an impact ends in a state of rest, with all the ever shorter flights that would follow it."""
@@ -229,11 +230,11 @@ class _Event:
             end = completed(model, k, t, self.before, jumped, self.state, state)
             ends = fired & end.possible & ((end.flight <= brief) | end.low)
             self.t_after, self.after = jax.tree.map(
-                lambda a, b, ends=ends: jnp.where(ends, a, b), (t + end.rest, end.y), (self.t_after, self.after)
+                lambda a, b, ends=ends: select(ends, a, b), (t + end.rest, end.y), (self.t_after, self.after)
             )
             self.result = RESULTS.where(fired & end.wrong, RESULTS.wrong_reset, self.result)
-            fresh = jnp.where(end.stays, jnp.where(end.rises, 1, 2), 0)
-            self.roots[k] = jnp.where(fired, fresh, self.roots[k]).astype(jnp.int32)
+            fresh = select(end.stays, select(end.rises, 1, 2), 0)
+            self.roots[k] = select(fired, fresh, self.roots[k]).astype(jnp.int32)
             if k in model.contacts:
                 moved = self.set_in_motion(k, state, jumped, brief)
                 self.at[k] = ends | ((self.modes[k] == 1) & ~moved)
@@ -247,13 +248,13 @@ class _Event:
         later, t = self.later, self.t
         level = later.level(k, t, y, state)
         (slack,) = later.rounding(lambda t, y: (later.level(k, t, y, state),), t, y, self.size)
-        free = state._replace(mode=tuple(jnp.where(j == k, 0, m) for j, m in enumerate(state.mode)))
+        free = state._replace(mode=tuple(select(j == k, 0, m) for j, m in enumerate(state.mode)))
         (pull,) = later.rates((k,), t, y, free, later.values(t, y, free))
         moved = level != self.model.level(k, t, self.before, state)
         moved = moved & (self.state.mode[k] == 1) & (jnp.abs(level) > 1e3 * slack)
         moved = moved & ((level < 0) | (2 * level > -pull * brief))
-        self.modes[k] = jnp.where(moved, 0, self.modes[k])
-        self.roots[k] = jnp.where(moved, (level > 0).astype(jnp.int32), self.roots[k])
+        self.modes[k] = select(moved, 0, self.modes[k])
+        self.roots[k] = select(moved, (level > 0).astype(jnp.int32), self.roots[k])
         return moved
 
     def choose(self) -> tuple[ModeState, Bool[Array, ""]]:
@@ -284,7 +285,7 @@ class _Event:
                 return self.later.guards(t, y, state, own)[own.index(True)]
 
             on_it = jnp.abs(guard(self.t, after)[0]) <= self.later.rounding(guard, self.t, after)[0]
-            roots[k] = jnp.where(self.fired[k], on_it.astype(jnp.int32), roots[k])
+            roots[k] = select(self.fired[k], on_it.astype(jnp.int32), roots[k])
         return state._replace(roots=tuple(roots))
 
     def jumped_to(self, state: ModeState, after: Y) -> Float[Array, " slots"]:
@@ -294,4 +295,4 @@ class _Event:
         onto = later.stacked(later.guards(self.t, after, state), jnp.inf)[:, 0]
         single = jnp.asarray([not s.holding and later.parts[s.switch] == 1 for s in later.slots])
         fresh = (onto > 0) & single & (later.stacked(later.known_roots(state), 0)[:, 0] == 0)
-        return jnp.where(fresh, onto, jnp.inf)
+        return select(fresh, onto, jnp.inf)

@@ -17,6 +17,7 @@ from ..._numerics._barrier import once
 from ..._numerics._bernstein import nodes, to_bernstein, to_chebyshev
 from ..._numerics._jaxpr import is_affine, is_constant
 from ..._numerics._linalg import product
+from ..._numerics._select import select
 from ..._numerics._series import Series
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
@@ -43,7 +44,7 @@ class _Samples(dfx.AbstractLocalInterpolation):
     def evaluate(self, t0: Scalar, t1: Scalar | None = None, left: bool = True) -> Y:
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
-        return bernstein(self.points, (t0 - self.t0) / jnp.where(self.t1 == self.t0, 1, self.t1 - self.t0))
+        return bernstein(self.points, (t0 - self.t0) / select(self.t1 == self.t0, 1, self.t1 - self.t0))
 
 
 class AbstractExponential(dfx.AbstractAdaptiveSolver):
@@ -70,7 +71,7 @@ class AbstractExponential(dfx.AbstractAdaptiveSolver):
         t0 = jnp.asarray(t0, jnp.result_type(*jax.tree.leaves(y0)))
         _check_affine(field, t0, y0, "the vector field")
         ys, error, _, fits = _sampled(field, t0, jnp.asarray(t1 - t0, t0.dtype), y0, field(t0, y0))
-        error = jax.tree.map(lambda e: jnp.where(fits, e, jnp.nan), error)
+        error = jax.tree.map(lambda e: select(fits, e, jnp.nan), error)
         y1 = ys[-1]
         return y1, error, dict(y0=y0, points=stack(_control_points(ys))), None, dfx.RESULTS.successful
 
@@ -150,11 +151,11 @@ def generator(
         factorials = (1.0, 1.0, 2.0, 6.0, 24.0)
         b1, b2, b3, b4 = (jnp.zeros_like(x) if c is None else w * c for w, c in zip(factorials[1:], terms[1:]))
         size = b1 @ b1 + b2 @ b2
-        squared = -(b1 @ b3 + b2 @ b4) / jnp.where(size == 0, 1, size)
+        squared = -(b1 @ b3 + b2 @ b4) / select(size == 0, 1, size)
         rate = jnp.sqrt(jnp.abs(squared))
         fast = rate * jnp.max(jnp.abs(b1)) + jnp.max(jnp.abs(b2))
         rest = jnp.maximum(
-            jnp.max(jnp.abs(b3 + squared * b1)), jnp.max(jnp.abs(b4 + squared * b2)) / jnp.where(rate == 0, 1, rate)
+            jnp.max(jnp.abs(b3 + squared * b1)), jnp.max(jnp.abs(b4 + squared * b2)) / select(rate == 0, 1, rate)
         )
         eps = float(jnp.finfo(t.dtype).eps)
         fits = lax.stop_gradient(rest <= 1e7 * eps * rate * fast)
@@ -166,13 +167,13 @@ def generator(
         still = moves <= 1e5 * eps * (jnp.max(jnp.abs(x)) + force * jnp.abs(dt))
         still = lax.stop_gradient(still & chance)
         fits = fits | still
-        b1, b2, squared = (jnp.where(still, 0, value) for value in (b1, b2, squared))
+        b1, b2, squared = (select(still, 0, value) for value in (b1, b2, squared))
         columns += [dt**2 * b1, dt**3 * b2]
         one, zero = jnp.ones_like(t), jnp.zeros_like(t)
         clock = jnp.stack([jnp.stack(row) for row in ([zero] * 3, [one, zero, -squared * dt**2], [zero, one, zero])])
     right = jnp.stack(columns, axis=1)
     scale = lax.stop_gradient(_largest([_largest(column) for column in columns]))
-    scale = jnp.where(scale > 0, scale, 1)
+    scale = select(scale > 0, scale, 1)
     below = jnp.zeros((len(columns), len(x)), t.dtype)
     return jnp.block([[matrix, right / scale], [below, clock]]), scale, fits
 
@@ -197,7 +198,7 @@ def expm(m: Square) -> Square:
         return _largest([sum(jnp.abs(x) for x in column) for column in lax.stop_gradient(p).T])
 
     size = jnp.maximum(norm(m2) ** (1 / 2), norm(m3) ** (1 / 3)) / _NEAR
-    halvings = jnp.ceil(jnp.log2(jnp.where((size > 1) & jnp.isfinite(size), size, 1)))
+    halvings = jnp.ceil(jnp.log2(select((size > 1) & jnp.isfinite(size), size, 1)))
     shrink = jnp.exp2(-halvings)
     powers = [jnp.eye(len(m), dtype=dtype), m * shrink, m2 * shrink**2, m3 * shrink**3]
     m4 = m4 * shrink**4
@@ -240,14 +241,14 @@ def _sampled(
     terms = lax.stop_gradient(jnp.abs(whole) @ _largest(z))[: len(x)] * jnp.abs(scale)
     allowed = max(1e-9, 1e4 * eps) * size + 64 * _N * eps * (terms + size)
     error = jnp.maximum(tail, 100 * missed)
-    excess = once(_largest(error / jnp.where(allowed > 0, allowed, 1)))
+    excess = once(_largest(error / select(allowed > 0, allowed, 1)))
     # Forcing that jumps, or has a kink, is of a known kind before it, and differs from the prediction after it.
     rate, f1 = scale * (m @ z[-1])[: len(x)], dt * flat(t + dt, x + moves[-1])
     size = [jnp.max(jnp.abs(v)) for v in (dt * jfu.ravel_pytree(f)[0], f1, rate, eps**0.5 * jnp.max(jnp.abs(m)) * size)]
     size += [] if force is None else [force * jnp.abs(dt)]
     allowed = max(1e-6, 64 * eps) * sum(size)
     if m.shape[0] > len(x) + 1:  # forcing that depends on time is no better known than the time is
-        pace = jnp.max(jnp.abs(m[: len(x), len(x) + 1 :])) * jnp.abs(scale) / jnp.where(dt == 0, 1, jnp.abs(dt))
+        pace = jnp.max(jnp.abs(m[: len(x), len(x) + 1 :])) * jnp.abs(scale) / select(dt == 0, 1, jnp.abs(dt))
         allowed = allowed + 8 * eps * jnp.abs(t + dt) * pace
     fits = fits & lax.stop_gradient(jnp.max(jnp.abs(f1 - rate)) <= allowed)
     return [unravel(x + move) for move in moves], unravel(error), excess, fits
@@ -314,7 +315,7 @@ class ExponentialStepper(Stepper):
                 touches = (ft.reduce(jnp.minimum, dips) <= error) & (ft.reduce(jnp.minimum, dense) > -error)
                 if slot.switch not in model.clocks:  # which have no near misses
                     resolved = resolved & ~(touches & (roots == 0) & (size > slack))
-        resolved = once(jnp.where(resolved, 1.0, 0.0)) > 0
+        resolved = once(select(resolved, 1.0, 0.0)) > 0
         return step._replace(guards=guards, noise=lax.stop_gradient(with_multipliers(model, noise)), resolved=resolved)
 
     def points(self, y: Y, y1: Y, ks: list[Y]) -> list[Y]:
@@ -327,7 +328,7 @@ class ExponentialStepper(Stepper):
         excess: Any = step.error
         keep = excess <= 1
         # What a polynomial misses grows with the power `_N` of the step.
-        factor = 0.8 * jnp.where(excess > 0, excess, 1e-30) ** (-1 / _N)
-        dt = (step.t_next - t) * jnp.clip(jnp.where(jnp.isnan(factor), 0.1, factor), 0.05, 10)
+        factor = 0.8 * select(excess > 0, excess, 1e-30) ** (-1 / _N)
+        dt = (step.t_next - t) * jnp.clip(select(jnp.isnan(factor), 0.1, factor), 0.05, 10)
         most = getattr(controller, "dtmax", None)
         return keep, jnp.minimum(dt, length if most is None else most)

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool
 
 from ..._numerics._autodiff import frozen
 from ..._numerics._barrier import once, stored
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
@@ -54,7 +55,7 @@ def largest_so_far(swing: Scalar, y: Y) -> Scalar:
 def _largest_so_far_jvp(primals: tuple[Scalar, Y], tangents: tuple[Scalar, Y]) -> tuple[Scalar, Scalar]:
     largest, dy = frozen(tangents)
     for x in jax.tree.leaves(dy):
-        largest = jnp.maximum(largest, jnp.max(jnp.where(jnp.isfinite(x), jnp.abs(x), 0)))
+        largest = jnp.maximum(largest, jnp.max(select(jnp.isfinite(x), jnp.abs(x), 0)))
     return largest_so_far(*primals), largest
 
 
@@ -99,9 +100,9 @@ def _trusted_jvp(primals: Any, tangents: Any) -> tuple[Scalar, Scalar]:
     ratios = jax.tree.map(lambda e, size: jnp.max(jnp.abs(e) / (floor + rtol * size)), stored(errors), sizes)
     worst = once(ft.reduce(jnp.maximum, jax.tree.leaves(ratios)))  # for each direction, not in one kernel for all
     lane = sum(jnp.sum(x) for x in jax.tree.leaves(step.y))
-    worst = once(_of_all_directions(jnp.where(step.kept & (worst < jnp.inf), worst, 0), lane) / SLACK)
+    worst = once(_of_all_directions(select(step.kept & (worst < jnp.inf), worst, 0), lane) / SLACK)
     # Far below the tolerance the error of one step says little of the next.
-    far = jnp.where(worst > 0.1, step.length * jnp.maximum(worst, 0.1) ** (-1 / order), jnp.inf)
+    far = select(worst > 0.1, step.length * jnp.maximum(worst, 0.1) ** (-1 / order), jnp.inf)
     far = jnp.maximum(far, _surely(worst > 1, step))
     return jnp.minimum(far, trusted(*primals)), jnp.zeros_like(far)
 
@@ -120,9 +121,9 @@ def _surely(doubted: Bool[Array, ""], step: Sensed) -> Scalar:
             norm = jnp.max(jnp.sum(jnp.abs(m), axis=1))
             size = size * norm ** (1 / power)
             rate = jnp.minimum(rate, size)
-            m = m / jnp.where(norm > 0, norm, 1)
+            m = m / select(norm > 0, norm, 1)
             m = m @ m
-        return jnp.where(rate > 0, NEVER_BELOW / jnp.where(rate > 0, rate, 1), jnp.inf)
+        return select(rate > 0, NEVER_BELOW / select(rate > 0, rate, 1), jnp.inf)
 
     none = jnp.zeros_like(step.t)
-    return jnp.where(doubted, lax.cond(eqxi.unvmap_any(doubted), length, lambda _: none, dynamic), none)
+    return select(doubted, lax.cond(eqxi.unvmap_any(doubted), length, lambda _: none, dynamic), none)

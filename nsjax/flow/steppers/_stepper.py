@@ -24,6 +24,7 @@ from ..._numerics._barrier import once
 from ..._numerics._bernstein import binomials, nodes, to_bernstein, to_chebyshev
 from ..._numerics._lane_cond import compact_cond
 from ..._numerics._rolled import rolled
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
@@ -127,7 +128,7 @@ class Stepper(eqx.Module):
     def least(self, c: list[Scalar], roots: Int[Array, ""]) -> Scalar:
         """A lower bound, up to a positive factor, of such a polynomial once its known roots at the start are divided
         out: here the smallest of its Bernstein coefficients, of which the first vanish with these roots."""
-        return ft.reduce(jnp.minimum, [jnp.where(j < roots, 1, x) if j < 3 else x for j, x in enumerate(c)])
+        return ft.reduce(jnp.minimum, [select(j < roots, 1, x) if j < 3 else x for j, x in enumerate(c)])
 
     def end(self, c: list[Scalar]) -> tuple[Scalar, Scalar]:
         """Value and slope of such a polynomial at the end of the step."""
@@ -177,7 +178,7 @@ def _looped(tableau: dfx.ButcherTableau, f: Field, span: tuple[Scalar, Scalar], 
     def stage(ks: Array, at: tuple[Array, Array, Scalar]) -> tuple[Array, Array]:
         i, row, c = at
         state = x + row @ ks
-        slope = f(jnp.where(c == 1, t_next, t + c * (t_next - t)), unravel(state))
+        slope = f(select(c == 1, t_next, t + c * (t_next - t)), unravel(state))
         k = (t_next - t).astype(x.dtype) * jfu.ravel_pytree(slope)[0]
         return lax.dynamic_update_index_in_dim(ks, k, i, 0), state
 
@@ -237,7 +238,7 @@ class RungeKutta(Stepper):
             y1 = stage if tableau.ssal else _combine(y, list(zip(map(float, tableau.b_sol), ks)))
             error = _combine(jax.tree.map(jnp.zeros_like, y), list(zip(map(float, tableau.b_error), ks)))
             # Free when the first stage of the next step is the last of this one.
-            safe = jnp.where(dt == 0, 1, dt)
+            safe = select(dt == 0, 1, dt)
             slope = jax.tree.map(lambda k: k / safe, ks[-1]) if tableau.fsal else None
             return Step(t_next, y1, error, ks, slope)
         terms = dfx.ODETerm(lambda t, y, args: f(t, y))

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from ..._numerics._bernstein import binomials
 from ..._numerics._linalg import row, WRITTEN_OUT
+from ..._numerics._select import select
 from ..._numerics._series import Coefficient, Series
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
@@ -34,7 +35,7 @@ class _Polynomial(dfx.AbstractLocalInterpolation):
     def evaluate(self, t0: Scalar, t1: Scalar | None = None, left: bool = True) -> Y:
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
-        u = (t0 - self.t0) / jnp.where(self.t1 == self.t0, 1, self.t1 - self.t0)
+        u = (t0 - self.t0) / select(self.t1 == self.t0, 1, self.t1 - self.t0)
         return _sum(self.y0, [jax.tree.map(lambda x, i=i: x * u ** (i + 1), k) for i, k in enumerate(self.k)])
 
 
@@ -214,7 +215,7 @@ class TaylorStepper(Stepper):
             if curved:
                 # A step that is not shortened ends where it was to end, whatever its beginning depends on.
                 share = lax.stop_gradient(_resolvable(curved, t_next - t))
-                t_next = jnp.where(share < 1, t + lax.stop_gradient(share * (t_next - t)), t_next)
+                t_next = select(share < 1, t + lax.stop_gradient(share * (t_next - t)), t_next)
         powers = _powers(t_next - t, self.degree)
         ks = _increments(ys, tree, powers)
         y1 = _sum(y, ks)
@@ -254,7 +255,7 @@ class TaylorStepper(Stepper):
         """Switch values of a mode, where the multipliers are known."""
         s = list(model.signs(t, state))
         for k, multiplier in zip(model.holdable, multipliers, strict=True):
-            s[k] = jnp.where(model.held(k, state.mode[k]), multiplier, s[k])
+            s[k] = select(model.held(k, state.mode[k]), multiplier, s[k])
         return tuple(s)
 
     def pace(self, controller: Any, step: Step, t: Scalar, y: Y, length: Scalar) -> Any:
@@ -265,7 +266,7 @@ class TaylorStepper(Stepper):
         errors = jax.tree.map(lambda e, y: jnp.max(e / (atol + rtol * jnp.abs(y))), step.error, y)
         keep = ft.reduce(jnp.maximum, jax.tree.leaves(errors)) <= 1
         most = getattr(controller, "dtmax", None)
-        return keep, jnp.where(keep, length if most is None else most, 0.5 * (step.t_next - t))
+        return keep, select(keep, length if most is None else most, 0.5 * (step.t_next - t))
 
     def estimate(self, step: Step) -> Y:
         return step.ks[-1]  # not its error, of which the absolute value has no derivative where it is zero
@@ -311,8 +312,8 @@ def _reach(ys: list[list[Coefficient]], rtol: Any, atol: Any) -> Scalar:
         sizes = [jnp.max(jnp.abs(y[i]) / scale) for y, scale in zip(ys, scales) if y[i] is not None]
         if sizes:
             size = ft.reduce(jnp.maximum, sizes)
-            log = jnp.minimum(log, jnp.where(size == 0, jnp.inf, -jnp.log(jnp.where(size == 0, 1, size)) / i))
-    return 0.9 * jnp.exp(jnp.where(jnp.isnan(log), jnp.inf, log))  # a step to where the field is NaN is rejected later
+            log = jnp.minimum(log, select(size == 0, jnp.inf, -jnp.log(select(size == 0, 1, size)) / i))
+    return 0.9 * jnp.exp(select(jnp.isnan(log), jnp.inf, log))  # a step to where the field is NaN is rejected later
 
 
 def _size(c: list[Scalar]) -> Scalar:
@@ -326,5 +327,5 @@ def _resolvable(columns: list[list[Scalar]], dt: Scalar) -> Scalar:
     for c in columns:
         c = [x * power for x, power in zip(c, _powers(dt, n))]
         ratio = 0.5 * unresolved(dt.dtype) * _size(c) / _size(c[-3:])
-        fit = jnp.minimum(fit, jnp.where(ratio < 1, ratio, 1) ** (1 / n))
+        fit = jnp.minimum(fit, select(ratio < 1, ratio, 1) ** (1 / n))
     return fit

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from ..._numerics._compile import interactive
 from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, THETA
+from ..._numerics._select import select
 from ..._numerics._text import between, shown, written
 from ..._types import Scalar, Y
 from ...flow._integrator import Integrator
@@ -84,7 +85,7 @@ class Flows(eqx.Module):
         smooth = ModeFlow(self.model, state)
         sol = integrate(smooth, a, b, unravel(x), self.integrator, saveat=saveat)
         flat = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys)
-        return jax.tree.map(lambda y: jnp.where(is_okay(sol.result), y, jnp.nan), flat)
+        return jax.tree.map(lambda y: select(is_okay(sol.result), y, jnp.nan), flat)
 
     def rows(self, fn: Any, begin: Array, end: Array, x: Array) -> Any:
         """`fn(a, b, x, state)` for every piece of every arc."""
@@ -118,7 +119,7 @@ class Flows(eqx.Module):
         ratio, _ = jfu.ravel_pytree(jax.tree.map(lambda y, tol: jnp.full_like(y, tol), self.y0, _spread(rtol, self.y0)))
 
         def sample(first: Scalar, last: Scalar, x: Array) -> tuple[Array, Array, tuple]:
-            begin, end, ts = times_between(a + (b - a) * first, jnp.where(last < 1, a + (b - a) * last, b), THETA)
+            begin, end, ts = times_between(a + (b - a) * first, select(last < 1, a + (b - a) * last, b), THETA)
             return ts, self.piece(begin, end, x, state, dfx.SaveAt(ts=ts)), ()
 
         def groups(ts: Array, xs: Array) -> tuple[list[Array], Array]:

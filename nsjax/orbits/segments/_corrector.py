@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool
 
 from ..._numerics._autodiff import frozen
 from ..._numerics._root import Newton
+from ..._numerics._select import select
 from ..._types import Scalar
 from ._equations import OrbitCurve
 from ._itinerary import OrbitItinerary
@@ -70,7 +71,7 @@ def newton_turns(
         u, linear = c.next, linear_at(curve, itinerary, c.next, origin)
         off = jnp.append(linear.f, border @ (u - origin) - distance)
         step = method.step(u, off, jnp.concatenate([linear.df, jnp.atleast_2d(border)]))
-        new, ended, good = (jnp.where(c.ended, old, now) for old, now in zip((u, True, c.good), step))
+        new, ended, good = (select(c.ended, old, now) for old, now in zip((u, True, c.good), step))
         spoilt = c.spoilt | curve.spoilt(linear.f, linear.df)
         return Turn(u, new, linear, ended, good, over=c.ended, spoilt=spoilt, count=c.count + 1)
 
@@ -128,5 +129,5 @@ def _at_root_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     df = eqx.filter_jvp(equations, (curve, origin), (dcurve, dorigin))[1]
     df = jnp.zeros_like(u) if df is None else df
     move = lx.linear_solve(lx.MatrixLinearOperator(linear.df), -df, solver=lx.LU(), throw=False).value
-    move = jnp.where(regular, move, jnp.nan)
+    move = select(regular, move, jnp.nan)
     return (u, linear), (move, eqx.filter_jvp(linearised, (u, curve, origin), (move, dcurve, dorigin))[1])

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._numerics._compile import interactive
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...flow._integrator import Integrator
 from ...system._impact import impact
@@ -163,7 +164,7 @@ class OrbitCurve(eqx.Module):
         index = jnp.arange(rows, dtype=itinerary.num.dtype)
         happened, final = index < itinerary.num, index == itinerary.num - 1
         mode, part = jnp.asarray(itinerary.mode), jnp.asarray(itinerary.part)
-        following = jnp.where(final[:, None], mode[:1], jnp.roll(mode, -1, axis=0))
+        following = select(final[:, None], mode[:1], jnp.roll(mode, -1, axis=0))
 
         def row(a: Scalar, b: Scalar, x: Array, mode: Array, part: Array) -> Array:
             return flow.arrive(a, b, x, self.state(mode, part))
@@ -178,50 +179,50 @@ class OrbitCurve(eqx.Module):
                 # Of several walls it is the one that is hit, which need not be the one that the segment has left.
                 hits = np.array([isinstance(s, impact) for s in model.switches])
                 hits = hits & (np.arange(len(hits), dtype=np.int32) == switch)
-                k = jnp.where(ends == EVENT, switch, -1)
-                state = self.state(mode, jnp.where(hits, wall, part))
+                k = select(ends == EVENT, switch, -1)
+                state = self.state(mode, select(hits, wall, part))
                 out = landing(model, k, t, self.unravel(x), state, tuple(after))
             return jfu.ravel_pytree(out[0])[0], out[1]
 
         after, rest = jax.vmap(jump)(end, last, mode, part, following, itinerary.slot, itinerary.ends)
-        before = jnp.where(index == 0, itinerary.num - 1, index - 1)
+        before = select(index == 0, itinerary.num - 1, index - 1)
         forced = None if self.autonomous else jnp.asarray(model.system.period, end.dtype) * self.order.astype(end.dtype)
         arrival = (end + rest)[before]
         anchor = jnp.zeros_like(end[0]) if forced is None else arrival[0] - forced
         # What begins away from events keeps its beginning.
-        anchor = jnp.where(itinerary.ends[itinerary.num - 1] == TIME, origin[0] * self.time, anchor)
-        started = begin - jnp.where(index == 0, anchor, arrival)
+        anchor = select(itinerary.ends[itinerary.num - 1] == TIME, origin[0] * self.time, anchor)
+        started = begin - select(index == 0, anchor, arrival)
         if self.pieces > 1:
-            started = jnp.where(index % self.pieces == 0, started, given[0] - begin)
+            started = select(index % self.pieces == 0, started, given[0] - begin)
 
         def ended(a: Scalar, b: Scalar, x: Array, last: Array, mode: Array, part: Array, *what: Array) -> Scalar:
             slot, entry, ends = what
             state = self.state(mode, part)
             out = self.guard(model, b, last, state, slot, entry)
-            out = jnp.where(ends == GRAZING, self.rate(model, b, last, state, slot, entry) * self.time, out)
+            out = select(ends == GRAZING, self.rate(model, b, last, state, slot, entry) * self.time, out)
             if model.holdable and model.slots:
                 holding = self.guard(model, a, x, state, slot, entry) + 1
                 for k in model.holdable:
                     if k not in model.contacts:
                         here = jnp.asarray([s.switch == k for s in model.slots])[slot]
-                        holding = jnp.where(here, holding - model.bound(k), holding)
-                out = jnp.where(ends == REPELLING_EXIT, holding, out)
+                        holding = select(here, holding - model.bound(k), holding)
+                out = select(ends == REPELLING_EXIT, holding, out)
             out = out / (jnp.asarray(self.guard_sizes)[slot] if model.slots else 1)
             closing = self.normal @ (first - self.reference) if forced is None else b - begin[0] - forced
-            return jnp.where(ends == TIME, closing, out)
+            return select(ends == TIME, closing, out)
 
         first, since, whence = x[0], begin, x
         if self.pieces > 1:  # what holds where a segment begins holds at its first piece
-            opening = jnp.where(itinerary.ends == REPELLING_EXIT, index - (self.pieces - 1), index)
+            opening = select(itinerary.ends == REPELLING_EXIT, index - (self.pieces - 1), index)
             since, whence = begin[opening], x[opening]
         what = itinerary.slot, itinerary.entry, itinerary.ends
         finish = jax.vmap(ended)(since, end, whence, last, mode, part, *what)
         if self.pieces > 1:
-            finish = jnp.where(itinerary.ends == PIECE, (given[1] - end) / self.time, finish)
+            finish = select(itinerary.ends == PIECE, (given[1] - end) / self.time, finish)
         # In the units of the unknowns.
         whole = jnp.concatenate([started[:, None] / self.time, finish[:, None], (x - after[before]) / self.sizes], 1)
         fill = (u - origin)[: len(u) - self.dimension].reshape(rows, -1)
-        return jnp.where(happened[:, None], whole, fill).ravel(), arrival[0] / self.time, last
+        return select(happened[:, None], whole, fill).ravel(), arrival[0] / self.time, last
 
 
 def guard_sizes(curve: OrbitCurve, start: Start) -> np.ndarray:
@@ -249,7 +250,7 @@ def guard_sizes_at(
     extra = *(jnp.repeat(column[:1], 3, axis=0) for column in (begin, x)), every, jnp.repeat(part[:1], 3, axis=0)
     rows = [jnp.concatenate(pair) for pair in zip(segments, extra)]
     found = jnp.max(jax.vmap(lambda *row: _gradients(curve, *row))(*rows), axis=0)
-    return jnp.where(jnp.isfinite(found) & (found > 0), found, 1.0)
+    return select(jnp.isfinite(found) & (found > 0), found, 1.0)
 
 
 def _gradients(curve: OrbitCurve, t: Scalar, x: Array, mode: Array, part: Array) -> Array:
@@ -257,13 +258,13 @@ def _gradients(curve: OrbitCurve, t: Scalar, x: Array, mode: Array, part: Array)
     state = curve.state(mode, part)
     by_t, by_x = jax.jacfwd(lambda t, x: curve.guards(curve.model, t, x, state), argnums=(0, 1))(t, x)
     both = jnp.concatenate([by_t[..., None] * curve.time, by_x * curve.sizes], axis=-1)
-    return jnp.max(jnp.where(jnp.isfinite(both), jnp.abs(both), 0), axis=(-2, -1))
+    return jnp.max(select(jnp.isfinite(both), jnp.abs(both), 0), axis=(-2, -1))
 
 
 def row_sizes(df: Array) -> Array:
     """A row that vanishes, as at a branch point of one state that is zero, is not made one of rounding."""
     sizes = jnp.max(jnp.abs(df), axis=1)
-    return jnp.where(sizes < VANISHES, 1, sizes)
+    return select(sizes < VANISHES, 1, sizes)
 
 
 @interactive

@@ -6,6 +6,7 @@ from jaxtyping import Array
 
 from ..._numerics._compile import interactive
 from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, RESOLVED
+from ..._numerics._select import select
 from ..._types import Scalar
 from ...system._mode import OFF
 from ._equations import OrbitCurve
@@ -17,7 +18,7 @@ def extremes(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> tuple[Ar
     """The least and the largest value of each component of the state along an orbit."""
     found = along_orbit(curve, itinerary, u, turns=True, guards=False).least
     inside = jnp.arange(len(found), dtype=itinerary.num.dtype) < itinerary.num
-    low, high = jnp.min(jnp.where(inside[:, None], found, jnp.inf), axis=0).reshape(2, -1)
+    low, high = jnp.min(select(inside[:, None], found, jnp.inf), axis=0).reshape(2, -1)
     return low, -high
 
 
@@ -31,10 +32,10 @@ def along_orbit(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, turns: b
         zeros = jnp.asarray(zeros_at_begin(curve, itinerary), x.dtype)  # rows, slots
         here = jnp.arange(slots, dtype=itinerary.slot.dtype) == itinerary.slot[:, None]
         index = jnp.arange(rows, dtype=itinerary.num.dtype)
-        after = jnp.where(index >= itinerary.num - 1, 0, index + 1)
+        after = select(index >= itinerary.num - 1, 0, index + 1)
         # On what is left freely it comes tangentially.
-        order = jnp.where(itinerary.ends[after] == REPELLING_EXIT, 2, 1)[:, None]
-        last = jnp.where((itinerary.ends == EVENT)[:, None] & here, order, 0)
+        order = select(itinerary.ends[after] == REPELLING_EXIT, 2, 1)[:, None]
+        last = select((itinerary.ends == EVENT)[:, None] & here, order, 0)
         orders = jnp.stack([zeros, last.astype(x.dtype)], axis=1)
     plain = jnp.zeros((rows, 2, 2 * len(curve.sizes)), x.dtype)
     orders = jnp.concatenate([plain, orders], axis=2)
@@ -54,7 +55,7 @@ def along_segment(curve: OrbitCurve, value: Array, segment: tuple, orders: Array
     )
 
     def sample(first: Scalar, last: Scalar, x: Array) -> tuple[Array, Array, Array]:
-        end = jnp.where(last < 1, a + (b - a) * last, b)
+        end = select(last < 1, a + (b - a) * last, b)
         return flow.along(a + (b - a) * first, end, x, state)
 
     def rows(t: Scalar, x: Array) -> list[list[Array]]:
@@ -68,7 +69,7 @@ def along_segment(curve: OrbitCurve, value: Array, segment: tuple, orders: Array
 
     def below(most: Array) -> Array:
         # The least value of a guard is of interest where it is about to vanish.
-        return jnp.where(places < 2 * n, jnp.inf if turns else -jnp.inf, 0.1 * most)
+        return select(places < 2 * n, jnp.inf if turns else -jnp.inf, 0.1 * most)
 
     return in_order(minima(sample, functions, x, orders[:, places], below), places)
 
@@ -77,14 +78,14 @@ def zeros_at_begin(curve: OrbitCurve, itinerary: OrbitItinerary) -> Array:
     """How many zeros each guard has at the beginning of each segment: that of the surface just left."""
     model = curve.model
     index = jnp.arange(len(itinerary.slot), dtype=itinerary.num.dtype)
-    before = jnp.where(index == 0, itinerary.num - 1, index - 1)
+    before = select(index == 0, itinerary.num - 1, index - 1)
     slot, ends, mode_before = itinerary.slot[before], itinerary.ends[before], jnp.asarray(itinerary.mode)[before]
     mode = jnp.asarray(itinerary.mode)
     columns = []
     switch = jnp.asarray([s.switch for s in model.slots], jnp.int32)[slot]
     entry = itinerary.entry[before]
     part = jnp.asarray([s.part for s in model.slots], jnp.int32)[slot]
-    component = jnp.where(entry > 0, entry, jnp.where(part >= 0, part, 0))
+    component = select(entry > 0, entry, select(part >= 0, part, 0))
     for s in model.slots:
         k = s.switch
         left = (switch == k) & ((ends == EVENT) | (ends == REPELLING_EXIT))
@@ -99,10 +100,10 @@ def zeros_at_begin(curve: OrbitCurve, itinerary: OrbitItinerary) -> Array:
             free = ~model.held(k, mode[:, k])
             slid = model.held(k, mode_before[:, k])
             if k in model.contacts:
-                order = jnp.where(slid, 3, 1)
+                order = select(slid, 3, 1)
             elif not model.static(k):
-                order = jnp.where(slid, 2, 1)
+                order = select(slid, 2, 1)
         if model.parts[k] > 1:  # above, each component is a guard of its own; below, they are one
-            free = free & (jnp.where(mode[:, k] < 0, 0, component) == s.part)
-        columns.append(jnp.where(left & free, order, 0))
+            free = free & (select(mode[:, k] < 0, 0, component) == s.part)
+        columns.append(select(left & free, order, 0))
     return jnp.stack([c.astype(jnp.result_type(float)) for c in columns], axis=1)

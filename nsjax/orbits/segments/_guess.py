@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..._numerics._compile import interactive
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...derivatives._saltation import after_event
 from ...derivatives._variational import arcs
@@ -61,7 +62,7 @@ class SegmentGuess(NamedTuple):
 
 def where(rows: Array, a: Any, b: Any) -> Any:
     """Row by row."""
-    return jax.tree.map(lambda a, b: jnp.where(rows.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), a, b)
+    return jax.tree.map(lambda a, b: select(rows.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), a, b)
 
 
 def cuts_of(system: System, sol: Solution, t0: Scalar, y0: Y) -> SegmentGuess:
@@ -74,7 +75,7 @@ def cuts_of(system: System, sol: Solution, t0: Scalar, y0: Y) -> SegmentGuess:
     if model.clocks:  # which have gone on
         steady = modes[:, np.array([k for k in range(modes.shape[1]) if k not in model.clocks], int)]
     closes = (index <= events.num) & jnp.all(steady == steady[0], axis=1)
-    num = jnp.max(jnp.where(closes, index, 0))
+    num = jnp.max(select(closes, index, 0))
     last = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), events.y_before, sol.y1)
     last = where(index < events.num, last, jax.tree.map(lambda x: jnp.broadcast_to(x, (len(begin), *x.shape)), sol.y1))
 
@@ -83,7 +84,7 @@ def cuts_of(system: System, sol: Solution, t0: Scalar, y0: Y) -> SegmentGuess:
 
     begin, end, y, modes, last = fill(begin, end), fill(end, end), fill(y, last), fill(modes, modes), fill(last, last)
     switch = jnp.append(events.switch, jnp.asarray(-1, events.switch.dtype))
-    switch, free = jnp.where(index < num, switch, -1), (False,) * len(begin)
+    switch, free = select(index < num, switch, -1), (False,) * len(begin)
     itinerary = _itinerary(model, (begin, y), (end, last), modes, switch, num + 1, free)
     return SegmentGuess(begin, end, y, itinerary, free)
 
@@ -105,8 +106,8 @@ def _itinerary(
     # What slides on a surface that repels is at its bound where it comes onto it.
     t, y = where(slides, first, last)
     slot, entry = jax.vmap(lambda k, t, y, mode: event_slot(model, k, t, y, mode))(switch, t, y, mode)
-    ends = jnp.where(slides, REPELLING_EXIT, EVENT)
-    ends = jnp.where(jnp.arange(len(mode), dtype=num.dtype) == num - 1, TIME, ends).astype(jnp.int32)
+    ends = select(slides, REPELLING_EXIT, EVENT)
+    ends = select(jnp.arange(len(mode), dtype=num.dtype) == num - 1, TIME, ends).astype(jnp.int32)
     parts = jnp.stack(part, axis=1) if part else jnp.zeros((len(mode), 0), jnp.int32)
     return OrbitItinerary(mode.astype(jnp.int32), parts, ends, slot, entry, num)
 
@@ -187,5 +188,5 @@ def landing(model: SwitchedSystem, k: Array, t: Scalar, y: Y, ending: ModeState,
     out = (y, jnp.zeros_like(t))
     for i in range(len(model.switches)):
         hit = after_event(model, i, t, y, ending, after)
-        out = jax.tree.map(lambda a, b, now=k == i: jnp.where(now, a, b), hit, out)
+        out = jax.tree.map(lambda a, b, now=k == i: select(now, a, b), hit, out)
     return out

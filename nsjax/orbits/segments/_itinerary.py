@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._numerics._compile import interactive, on_host
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...flow._solution import Events
 from ...system._model import SwitchedSystem
@@ -120,13 +121,13 @@ def event_slot(
         here = first + parts[i]
         if isinstance(switch, sgn) and model.parts[i] > 1:  # below its components are one guard
             below = mode[i] < 0
-            here, inside = jnp.where(below, first, here), jnp.where(below, parts[i], 0)
+            here, inside = select(below, first, here), select(below, parts[i], 0)
         if i in model.holdable:
             up = slot_of(model, i, True, 1)
-            bound = up if i in model.contacts else jnp.where(values[i] > 0, up, slot_of(model, i, True, -1))
+            bound = up if i in model.contacts else select(values[i] > 0, up, slot_of(model, i, True, -1))
             held = model.held(i, mode[i])
-            here, inside = jnp.where(held, bound, here), jnp.where(held, 0, inside)
-        slot, entry = (jnp.where(k == i, now, old).astype(jnp.int32) for now, old in ((here, slot), (inside, entry)))
+            here, inside = select(held, bound, here), select(held, 0, inside)
+        slot, entry = (select(k == i, now, old).astype(jnp.int32) for now, old in ((here, slot), (inside, entry)))
     return slot, entry
 
 

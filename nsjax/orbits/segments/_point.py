@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool
 
 from ..._numerics._repeated import Repeated, Same
 from ..._numerics._root import Newton
+from ..._numerics._select import select
 from ..._types import Scalar
 from ...derivatives._floquet import floquet, structural_zeros
 from ...system._model import SwitchedSystem
@@ -146,19 +147,19 @@ def _seen(curve: OrbitCurve, itinerary: OrbitItinerary, turn: Turn, plane: Plane
     factors = factors_of(curve, itinerary, u, df, closing)
     index = jnp.arange(rows, dtype=itinerary.num.dtype)
     mode = jnp.asarray(itinerary.mode)
-    zeros = structural_zeros(model.system, jnp.where((index < itinerary.num)[:, None], mode, mode[:1]))
+    zeros = structural_zeros(model.system, select((index < itinerary.num)[:, None], mode, mode[:1]))
     found = floquet(factors, zeros, curve.autonomous)
     free = jnp.any((itinerary.ends == REPELLING_EXIT) & (index < itinerary.num))
     either = zip(_infinitely_unstable(n, curve.autonomous), found)
-    monodromy, multipliers, stable = (jnp.where(free, x, y) for x, y in either)
+    monodromy, multipliers, stable = (select(free, x, y) for x, y in either)
 
     # Along the way.
     inside = (index < itinerary.num)[:, None]
     along = along_orbit(curve, itinerary, u, turns)
     least = along.least[:, 2 * n :]
-    low, high = jnp.min(jnp.where(inside, along.least[:, : 2 * n], jnp.inf), axis=0).reshape(2, n)
-    length = jnp.sum(jnp.where(inside[:, 0], end - begin, 0))
-    mean, square = jnp.sum(jnp.where(inside[..., None], along.sums, 0), axis=0) / length
+    low, high = jnp.min(select(inside, along.least[:, : 2 * n], jnp.inf), axis=0).reshape(2, n)
+    length = jnp.sum(select(inside[:, 0], end - begin, 0))
+    mean, square = jnp.sum(select(inside[..., None], along.sums, 0), axis=0) / length
     period = end[itinerary.num - 1] - begin[0]
     if not curve.autonomous:
         period = jnp.asarray(model.system.period, u.dtype) * curve.order.astype(u.dtype)
@@ -184,7 +185,7 @@ def factors_of(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, df: Array
     n, rows = len(curve.sizes), len(begin)
     model = curve.model_at(value)
     index = jnp.arange(rows, dtype=itinerary.num.dtype)
-    after = jnp.where(index >= itinerary.num - 1, 0, index + 1)
+    after = select(index >= itinerary.num - 1, 0, index + 1)
     mode, part = jnp.asarray(itinerary.mode), jnp.asarray(itinerary.part)
     field = (
         jax.vmap(lambda t, x, m, p: jfu.ravel_pytree(model.flow(t, curve.unravel(x), curve.state(m, p)))[0])(
@@ -197,23 +198,23 @@ def factors_of(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, df: Array
     own, on = blocks[index, :, index], blocks[after, :, index]
     # The next segment of the last one begins where it ends; of a single one it is the same.
     itself = jnp.zeros(n + 2, u.dtype).at[2:].set(1)
-    on = jnp.where(itinerary.num == 1, on - jnp.diag(itself), on)
+    on = select(itinerary.num == 1, on - jnp.diag(itself), on)
     final = (index == itinerary.num - 1)[:, None]
-    on = on.at[:, 0].set(jnp.where(final, -closing[: len(df)].reshape(rows, n + 2), on[:, 0]))
-    on = jnp.where((itinerary.ends == TIME)[:, None, None], on.at[:, 0].set(0), on)
+    on = on.at[:, 0].set(select(final, -closing[: len(df)].reshape(rows, n + 2), on[:, 0]))
+    on = select((itinerary.ends == TIME)[:, None, None], on.at[:, 0].set(0), on)
 
     def factor(own: Array, on: Array, ends: Array, last_field: Array) -> Array:
         # Unknown of a segment: begin, end, x. Its equations: started, finished, continued.
         by_x, by_end = own[1, 2:], own[1, 1]
-        slope = jnp.where(ends == EVENT, by_end, 1)
-        move = jnp.where(ends == EVENT, -by_x / slope, 0)  # of the end of the segment
+        slope = select(ends == EVENT, by_end, 1)
+        move = select(ends == EVENT, -by_x / slope, 0)  # of the end of the segment
         shift = -(on[0, 1] * move + on[0, 2:])  # of the beginning of the next
         plain = -(on[2:, 2:] + jnp.outer(on[2:, 1], move))
         return plain - jnp.outer(last_field, shift)
 
     factors = jax.vmap(factor)(own, on, itinerary.ends, field[after])
     factors = factors * curve.sizes[:, None] / curve.sizes[None, :]
-    return jnp.where((index < itinerary.num)[:, None, None], factors, jnp.eye(n, dtype=u.dtype))
+    return select((index < itinerary.num)[:, None, None], factors, jnp.eye(n, dtype=u.dtype))
 
 
 def _infinitely_unstable(n: int, autonomous: bool) -> tuple[Array, Array, Array]:
@@ -230,7 +231,7 @@ def _at_ends(
         return -jnp.ones_like(end), jnp.zeros_like(end), jnp.ones_like(end)
     mode, part = jnp.asarray(itinerary.mode), jnp.asarray(itinerary.part)
     final = jnp.arange(len(end), dtype=itinerary.num.dtype) == itinerary.num - 1
-    following = jnp.where(final[:, None], mode[:1], jnp.roll(mode, -1, axis=0))
+    following = select(final[:, None], mode[:1], jnp.roll(mode, -1, axis=0))
 
     def row(t: Scalar, x: Array, m: Array, p: Array, after: Array, slot: Array, entry: Array) -> tuple:
         state = curve.state(m, p)
@@ -239,12 +240,12 @@ def _at_ends(
             if k in model.contacts:
                 continue
             here = jnp.asarray([s.switch == k for s in model.slots])[slot] & (m[k] != 0) & (after[k] != 0)
-            held = state._replace(mode=tuple(jnp.where(i == k, 0, mi) for i, mi in enumerate(state.mode)))
+            held = state._replace(mode=tuple(select(i == k, 0, mi) for i, mi in enumerate(state.mode)))
             if model.parts[k] > 1:
-                touched = jnp.where(entry > 0, entry, jnp.asarray([s.part for s in model.slots], jnp.int32)[slot])
+                touched = select(entry > 0, entry, jnp.asarray([s.part for s in model.slots], jnp.int32)[slot])
                 held = held._replace(part=tuple(touched if i == k else q for i, q in enumerate(held.part)))
             value = model.values(t, curve.unravel(x), held)[k]
-            margin = jnp.where(here, jnp.abs(value) - model.bound(k), margin)
+            margin = select(here, jnp.abs(value) - model.bound(k), margin)
         rate = curve.rate(model, t, x, state, slot, entry)
         return rate, curve.guard(model, t, x, state, slot, entry), margin
 

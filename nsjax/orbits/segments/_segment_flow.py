@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from ..._numerics._compile import interactive
 from ..._numerics._minima import NODES, THETA, WEIGHTS
+from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...flow._integrator import Integrator
 from ...flow._mode_flow import ModeFlow, VariedModeFlow
@@ -86,14 +87,14 @@ class SegmentFlow(eqx.Module):
             return ts, xs, jnp.stack([jnp.sum(weights * xs, axis=0), jnp.sum(weights * xs**2, axis=0)])
         span = jnp.abs(b - a)
         # Of a segment without length every point is its beginning.
-        far = jnp.where(span > 0, b, jnp.nextafter(a, jnp.inf))
+        far = select(span > 0, b, jnp.nextafter(a, jnp.inf))
         none = jax.tree.map(jnp.zeros_like, self.like)
-        saveat = dfx.SaveAt(subs=dfx.SubSaveAt(ts=jnp.where(span > 0, ts, a), fn=lambda t, y, args: y[0]))
+        saveat = dfx.SaveAt(subs=dfx.SubSaveAt(ts=select(span > 0, ts, a), fn=lambda t, y, args: y[0]))
         summed = _Summed(self.model, state)
         sol = integrate(summed, a, far, (self.unravel(x), none, none), self.integrator, saveat=saveat)
         xs = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys)
         sums = jnp.stack([jfu.ravel_pytree(part)[0] for part in sol.y1[1:]])
-        return ts, jnp.where(span > 0, xs, x), jnp.where(span > 0, sums, 0)
+        return ts, select(span > 0, xs, x), select(span > 0, sums, 0)
 
 
 def exactness(model: SwitchedSystem, t: Scalar, y: Y) -> int:
@@ -137,7 +138,7 @@ def _exponential(
     """The state at the end, and its derivative by that at the beginning."""
     m, scale, good = flow.generator(a, b, x, state)
     n, e = len(x), expm(m)
-    return jnp.where(good, x + scale * e[:n, n], jnp.nan), e[:n, :n]
+    return select(good, x + scale * e[:n, n], jnp.nan), e[:n, :n]
 
 
 def _samples(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeState) -> Float[Array, "nodes n"]:
@@ -157,7 +158,7 @@ def _samples(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeState
     weights = jnp.asarray(_hermite(THETA * NODES - cell), x.dtype)
     rows = [part[:n, cell + k] for k in (0, 1) for part in (z, first, second, third)]
     out = sum(w * row for w, row in zip(weights, rows))
-    return jnp.where(good, x[:, None] + scale * out, jnp.nan).T
+    return select(good, x[:, None] + scale * out, jnp.nan).T
 
 
 def _hermite(s: np.ndarray) -> np.ndarray:
@@ -175,7 +176,7 @@ def _arrive(flow: SegmentFlow, a: Any, b: Any, x: Any, state: Any) -> Array:
         return _exponential(flow, a, b, x, state)[0]
     smooth = ModeFlow(flow.model, state)
     sol = integrate(smooth, a, b, flow.unravel(x), flow.integrator)
-    return jnp.where(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0], jnp.nan)
+    return select(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0], jnp.nan)
 
 
 @_arrive.def_jvp
@@ -232,6 +233,6 @@ def _varied(
     columns = jax.vmap(flow.unravel)(eye[:, :n])
     sol = integrate(VariedModeFlow(flow.model, state, moved), a, b, (flow.unravel(x), columns), flow.integrator)
     y, along = sol.y1
-    out = jnp.where(is_okay(sol.result), jfu.ravel_pytree(y)[0], jnp.nan)
+    out = select(is_okay(sol.result), jfu.ravel_pytree(y)[0], jnp.nan)
     phi = jax.vmap(lambda c: jfu.ravel_pytree(c)[0], out_axes=1)(along)
     return out, phi[:, :n], phi[:, n:]

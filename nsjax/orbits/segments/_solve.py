@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from ..._numerics._autodiff import frozen
 from ..._numerics._compile import interactive
 from ..._numerics._root import Newton
+from ..._numerics._select import select
 from ..._types import Scalar
 from ...derivatives._floquet import floquet, forwards, structural_zeros
 from ...derivatives._saltation import saltation_matrices
@@ -63,7 +64,7 @@ def by_segments(
     events = _log(curve, itinerary, u, linear)
     index = jnp.arange(len(begin), dtype=num.dtype)
     mode = itinerary.mode
-    zeros = structural_zeros(system, jnp.where((index < num)[:, None], mode, mode[:1]))
+    zeros = structural_zeros(system, select((index < num)[:, None], mode, mode[:1]))
     if any(guess.free):
         monodromy, multipliers, stable = _backwards(curve, itinerary, u, linear, events, guess.free)
     else:
@@ -129,7 +130,7 @@ def _problem(
         pieces=pieces,
     )
     f = ravel(still.flow(guess.begin[0], y0, blank.state(rows.mode[0], rows.part[0])))
-    normal = f / jnp.where(f @ f == 0, 1, f @ f)
+    normal = f / select(f @ f == 0, 1, f @ f)
     sizes = guard_sizes_at(frozen(blank), rows, guess.begin, x)
     curve = dataclasses.replace(blank, normal=normal, guard_sizes=sizes)
     if pieces == 1:
@@ -145,7 +146,7 @@ def _problem(
     start = jax.vmap(cut)(guess.begin, guess.end, x, rows.mode, rows.part).ravel()
     mode, part, ends, slot, entry = (jnp.repeat(column, pieces, axis=0) for column in rows[:5])
     last = jnp.arange(len(ends), dtype=rows.num.dtype) % pieces == pieces - 1
-    ends = jnp.where(last, ends, PIECE)
+    ends = select(last, ends, PIECE)
     return curve, OrbitItinerary(mode, part, ends, slot, entry, rows.num * pieces), start
 
 
@@ -155,7 +156,7 @@ def _states_at(
     """States at given times of the orbit."""
     begin, _, x, _ = curve.parts(u)
     index = jnp.arange(len(begin), dtype=itinerary.num.dtype)
-    starts, flow = jnp.where(index < itinerary.num, begin, jnp.inf), curve.flow(curve.model)
+    starts, flow = select(index < itinerary.num, begin, jnp.inf), curve.flow(curve.model)
 
     def one(t: Scalar) -> Array:
         i = jnp.maximum(jnp.searchsorted(starts, t, side="right") - 1, 0)
@@ -208,16 +209,16 @@ def _backwards(
     leaves = jnp.asarray(free)
     # All but the last piece of a segment end in the middle of it.
     onto = jnp.repeat(jnp.roll(leaves, -1), curve.pieces) & (itinerary.ends == EVENT)
-    smooth = itinerary._replace(ends=jnp.where(onto, PIECE, itinerary.ends))
+    smooth = itinerary._replace(ends=select(onto, PIECE, itinerary.ends))
     factors = jnp.linalg.inv(factors_of(curve, smooth, u, linear.df, linear.closing))
     before, after = (
-        jnp.where(leaves[:, None], *pair)
+        select(leaves[:, None], *pair)
         for pair in ((events.mode_after, events.mode_before), (events.mode_before, events.mode_after))
     )
     swapped = eqx.tree_at(lambda e: (e.mode_before, e.mode_after), events, (before, after))
-    jumps = jnp.where(leaves[:, None, None], saltation_matrices(curve.model.system, swapped), 0)
+    jumps = select(leaves[:, None, None], saltation_matrices(curve.model.system, swapped), 0)
     last = slice(curve.pieces - 1, None, curve.pieces)
-    factors = factors.at[last].set(jnp.where(leaves[:, None, None], factors[last] @ jumps, factors[last]))
+    factors = factors.at[last].set(select(leaves[:, None, None], factors[last] @ jumps, factors[last]))
     infinite = jnp.asarray(sum(free), jnp.int32)
     return forwards(floquet(factors[::-1], infinite, curve.autonomous), infinite, curve.autonomous)
 
@@ -238,6 +239,6 @@ def _violation(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> tuple[
     t = begin[:, None] + share * (end - begin)[:, None]
     size = jnp.max(jnp.maximum(jnp.abs(least), jnp.abs(most)), axis=0)
     late = jnp.arange(len(begin), dtype=itinerary.num.dtype) >= itinerary.num
-    short = jnp.where((least < -1e-7 * size) & ~late[:, None], -least, 0)
+    short = select((least < -1e-7 * size) & ~late[:, None], -least, 0)
     worst = jnp.argmax(short)
     return short.ravel()[worst], t.ravel()[worst]

@@ -7,6 +7,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ...._numerics._select import select
 from ...._types import Scalar
 from ....orbits.segments._corrector import Plane
 from ....orbits.segments._equations import OrbitCurve
@@ -76,7 +77,7 @@ def values_of(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary, log
     smooth = jnp.stack([look.tangent[-1], branch_value(look, log)])
     circle = circle_values(look.multipliers, curve.autonomous)
     ends = jnp.stack([share, 1 - share])
-    return jnp.concatenate([ends, jnp.where(there, corners, 1), smooth, circle])
+    return jnp.concatenate([ends, select(there, corners, 1), smooth, circle])
 
 
 def place_of(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary, log: Scalar) -> Place:
@@ -84,10 +85,8 @@ def place_of(curve: OrbitCurve, look: PointData, itinerary: OrbitItinerary, log:
     mode, held = jnp.asarray(itinerary.mode), jnp.zeros(len(look.begin), bool)
     for k in curve.model.holdable:
         held |= curve.model.held(k, mode[:, k])
-    length = jnp.where(
-        jnp.arange(len(held), dtype=itinerary.num.dtype) < itinerary.num, look.end - look.begin, -jnp.inf
-    )
-    i = jnp.argmax(length * jnp.where(held, 1e-6, 1.0))
+    length = select(jnp.arange(len(held), dtype=itinerary.num.dtype) < itinerary.num, look.end - look.begin, -jnp.inf)
+    i = jnp.argmax(length * select(held, 1e-6, 1.0))
     middle = look.ts.shape[1] // 2
     row = Row(
         look.parameter, look.period, look.ts[i, middle], look.xs[i, middle], look.u, look.multipliers,
@@ -117,7 +116,7 @@ def follow_lane(
     ends = jnp.asarray([test != BRANCH and test.kind not in PASSED for test in tests])
     lane = Lane(
         at=at, far=at, bend=jnp.zeros_like(u), length=zero,
-        doing=jnp.where(found, STARTING, NO_ORBIT).astype(jnp.int32), wanted=jnp.zeros_like(ends), target=none,
+        doing=select(found, STARTING, NO_ORBIT).astype(jnp.int32), wanted=jnp.zeros_like(ends), target=none,
         near=jnp.zeros(2, u.dtype), off=jnp.zeros(2, u.dtype), tries=none, end=jnp.full_like(zero, jnp.inf), last=none,
         arc=zero, rows=rows, arcs=jnp.zeros(points, u.dtype), kinds=jnp.full(points, -1, jnp.int32), count=none,
         work=none,
@@ -128,13 +127,13 @@ def follow_lane(
 
     def step(lane: Lane) -> Lane:
         moved = _moved(curve, itinerary, lane, ends, upwards, max_step)
-        return jax.tree.map(lambda new, old: jnp.where(going(lane), new, old), moved, lane)
+        return jax.tree.map(lambda new, old: select(going(lane), new, old), moved, lane)
 
     return lax.while_loop(going, step, lane)
 
 
 def _written(lane: Lane, row: Row, arc: Scalar, kind: Any, when: Bool[Array, ""]) -> Lane:
-    index = jnp.where(when, lane.count, len(lane.arcs))  # past the end it is dropped
+    index = select(when, lane.count, len(lane.arcs))  # past the end it is dropped
 
     def put(buffer: Array, value: Any) -> Array:
         return buffer.at[index].set(value, mode="drop")
@@ -152,35 +151,35 @@ def _moved(
 ) -> Lane:
     """One more orbit: the next point, or one nearer to a zero."""
     at, locating, starting = lane.at, lane.doing == LOCATING, lane.doing == STARTING
-    chord = (lane.far.u - at.u) / jnp.where(locating, lane.length, 1)
-    s = jnp.where(locating, _between(lane), lane.length)
-    guess = jnp.where(locating, at.u + s * chord, _ahead(lane, s))
+    chord = (lane.far.u - at.u) / select(locating, lane.length, 1)
+    s = select(locating, _between(lane), lane.length)
+    guess = select(locating, at.u + s * chord, _ahead(lane, s))
     look = corrected(curve, itinerary, Plane(at.u, at.tangent, s), guess, turns=False)
-    turn = jnp.where(starting & (look.tangent[-1] * upwards < 0), -1, 1).astype(s.dtype)
+    turn = select(starting & (look.tangent[-1] * upwards < 0), -1, 1).astype(s.dtype)
     # The sign of a determinant of which the tangent is a row.
     look = look._replace(tangent=turn * look.tangent, branch=look.branch * jnp.stack([turn, jnp.ones_like(turn)]))
-    here = place_of(curve, look, itinerary, jnp.where(starting, look.branch[1], at.log))
+    here = place_of(curve, look, itinerary, select(starting, look.branch[1], at.log))
     lane = lane._replace(work=lane.work + 1)
     first = lane._replace(
         at=here,
         far=here,
         length=jnp.full_like(s, FIRST),
-        doing=jnp.where(look.good, STEPPING, NO_ORBIT).astype(jnp.int32),
+        doing=select(look.good, STEPPING, NO_ORBIT).astype(jnp.int32),
     )
     options = (
         _written(first, here.row, s, -1, look.good),
         _located(lane, here, look.good, s, ends, max_step),
         _stepped(lane, here, look.good, ends, max_step),
     )
-    return jax.tree.map(lambda a, b, c: jnp.where(starting, a, jnp.where(locating, b, c)), *options)
+    return jax.tree.map(lambda a, b, c: select(starting, a, select(locating, b, c)), *options)
 
 
 def _between(lane: Lane) -> Scalar:
     """Where the secant of the bracket vanishes, or its middle (the second half of tries)."""
     (a, b), (fa, fb) = lane.near, lane.off
-    s = (a * fb - b * fa) / jnp.where(fb == fa, 1, fb - fa)
+    s = (a * fb - b * fa) / select(fb == fa, 1, fb - fa)
     inside = (s > a) & (s < b) & (lane.tries < TRIES // 2)
-    return jnp.where(inside, s, (a + b) / 2)
+    return select(inside, s, (a + b) / 2)
 
 
 def _ahead(lane: Lane, s: Scalar) -> Array:
@@ -192,22 +191,22 @@ def _on(lane: Lane, here: Place, max_step: Array, passes: Bool[Array, ""]) -> La
     """At the end of the step, if it `passes`, with the length of the next."""
     turn = turn_between(lane.at.tangent, here.tangent)
     length = next_length(lane.length, turn, here.tangent, here.u, max_step)
-    bend = (here.tangent - lane.at.tangent) / jnp.where(passes, lane.length, 1)
+    bend = (here.tangent - lane.at.tangent) / select(passes, lane.length, 1)
     new = lane._replace(at=here, bend=bend, length=length, arc=lane.arc + lane.length)
-    return jax.tree.map(lambda new, old: jnp.where(passes, new, old), new, lane)
+    return jax.tree.map(lambda new, old: select(passes, new, old), new, lane)
 
 
 def _stepped(lane: Lane, here: Place, good: Array, ends: Array, max_step: Array) -> Lane:
     turn = turn_between(lane.at.tangent, here.tangent)
     good = good & (turn <= TURNED) & jnp.all(jnp.isfinite(here.values))
     before, after = lane.at.values, here.values
-    changed = jnp.where(ends, (before > 0) & (after <= 0), before * after < 0)
+    changed = select(ends, (before > 0) & (after <= 0), before * after < 0)
     passes = good & ~jnp.any(changed)
     shorter = lane.length / 2
     lost = ~good & (shorter < SHORTEST)
-    on = _on(lane._replace(length=jnp.where(good, lane.length, shorter)), here, max_step, passes)._replace(
+    on = _on(lane._replace(length=select(good, lane.length, shorter)), here, max_step, passes)._replace(
         far=here,
-        doing=jnp.where(lost, LOST, jnp.where(good & ~passes, LOCATING, STEPPING)).astype(jnp.int32),
+        doing=select(lost, LOST, select(good & ~passes, LOCATING, STEPPING)).astype(jnp.int32),
         wanted=changed & good,
         end=jnp.full_like(lane.end, jnp.inf),
     )
@@ -230,29 +229,27 @@ def _located(lane: Lane, here: Place, good: Array, s: Scalar, ends: Array, max_s
     value = here.values[lane.target]
     (a, b), (fa, fb) = lane.near, lane.off
     left = value * fa > 0  # the zero is on the other side
-    same = jnp.where(left, a, b) != jnp.where(left, 0, lane.length)  # that end has moved before
-    near = jnp.where(left, jnp.stack([s, b]), jnp.stack([a, s]))
-    off = jnp.where(
-        left, jnp.stack([value, jnp.where(same, fb / 2, fb)]), jnp.stack([jnp.where(same, fa / 2, fa), value])
-    )
+    same = select(left, a, b) != select(left, 0, lane.length)  # that end has moved before
+    near = select(left, jnp.stack([s, b]), jnp.stack([a, s]))
+    off = select(left, jnp.stack([value, select(same, fb / 2, fb)]), jnp.stack([select(same, fa / 2, fa), value]))
     tries = lane.tries + 1
     # Beside a singular point there is no orbit to be had: what is known by then is all.
-    closed = ~good | (value == 0) | (near[1] - near[0] < 1e-14) | (jnp.abs(s - jnp.where(left, a, b)) < 1e-13)
+    closed = ~good | (value == 0) | (near[1] - near[0] < 1e-14) | (jnp.abs(s - select(left, a, b)) < 1e-13)
     closed = closed | (tries >= TRIES)
     done = lane._replace(near=near, off=off, tries=tries)
     ending = closed & ends[lane.target] & (s < lane.end)
-    end, last = jnp.where(ending, s, lane.end), jnp.where(ending, lane.target, lane.last)
+    end, last = select(ending, s, lane.end), select(ending, lane.target, lane.last)
     done = _written(done, here.row, lane.arc + s, lane.target, closed & good)
     wanted = lane.wanted & ~(closed & (jnp.arange(len(ends), dtype=lane.target.dtype) == lane.target))
     over = closed & ~jnp.any(wanted)
     ended = over & jnp.isfinite(end)
     passes = over & ~ended
     after = _on(done, lane.far, max_step, passes)._replace(
-        doing=jnp.where(ended, ENDED, jnp.where(passes, STEPPING, LOCATING)).astype(jnp.int32),
+        doing=select(ended, ENDED, select(passes, STEPPING, LOCATING)).astype(jnp.int32),
         wanted=wanted,
         end=end,
         last=last,
     )
     aimed = _aimed(after)
-    after = jax.tree.map(lambda a, b: jnp.where(closed & ~over, a, b), aimed, after)
+    after = jax.tree.map(lambda a, b: select(closed & ~over, a, b), aimed, after)
     return _written(after, lane.far.row, after.arc, -1, passes)
