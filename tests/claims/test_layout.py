@@ -64,6 +64,11 @@ def test_modules_import_only_those_below(name):
     assert not above
 
 
+def test_choices_are_one_operation():
+    """`jnp.where` is a function of its own in a program: see `select`."""
+    assert [path.name for path in PACKAGE.rglob("*.py") if "jnp.where(" in path.read_text()] == ["_select.py"]
+
+
 def test_importing_is_light_and_changes_nothing():
     code = (
         "import sys, jax\n"

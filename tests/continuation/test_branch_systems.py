@@ -326,6 +326,7 @@ def test_end_in_a_continuum():
         assert "end of the branch in a continuum of orbits" in branch.ends[0]
 
 
+@pytest.mark.slow
 def test_relay():
     """A thermostat: its period in closed form, from where the orbit shrinks to a point to where it takes for ever."""
     system = Thermostat()

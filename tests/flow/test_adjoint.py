@@ -79,7 +79,8 @@ def learned_forward():
     return jax.jit(jax.jacfwd(lambda p: learned(p, dfx.ForwardMode())))(LEARNED)
 
 
-@pytest.mark.parametrize("adjoint", ["jacobian", pytest.param("checkpoint", marks=pytest.mark.slow)])
+@pytest.mark.slow  # (by default against closed forms, below)
+@pytest.mark.parametrize("adjoint", ADJOINTS)
 def test_reverse_is_forward(learned_forward, adjoint):
     """Sliding entry, static breakaway, event times; by initial state, parameters, and the numbers of a network, whose
     activation is a function that comes back with the solution's system."""
@@ -126,18 +127,16 @@ def test_lanes(forward, adjoint):
     assert np.isfinite(gradient).all()
 
 
-def test_lanes_that_have_ended():
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_lanes_that_have_ended(adjoint):
     """Pitfall 18: a lane that has ended goes on with steps of no length, whose NaN must not reach the gradient."""
 
-    def end(x, t1, adjoint):
-        options = models.CHEAP | dict(max_steps=16, max_events=2)
-        return solve(
-            gallery.SlidingPoint(), 0.0, t1, type(gallery.THESIS["(2.3)"].y0)(x), adjoint=adjoint, **options
-        ).y1.x
+    def end(x, t1):
+        options = models.CHEAP | dict(max_steps=16, max_events=2, adjoint=ADJOINTS[adjoint])
+        return solve(gallery.SlidingPoint(), 0.0, t1, type(gallery.THESIS["(2.3)"].y0)(x), **options).y1.x
 
     x, t1 = jnp.asarray([2.0, 3.0, 1.0]), jnp.asarray([1e-4, 2.0, 2.0])
-    lanes = jax.vmap(jax.grad(lambda x, t1: end(x, t1, ADJOINTS["checkpoint"]), argnums=(0, 1)))
-    dx, dt = jax.jit(lanes)(x, t1)
+    dx, dt = jax.jit(jax.vmap(jax.grad(end, argnums=(0, 1))))(x, t1)
     np.testing.assert_allclose(dx, [1, 1, 0], atol=1e-12)
     np.testing.assert_allclose(dt, [-1, -1, 0], atol=1e-12)
 

@@ -305,6 +305,7 @@ class Ramp(NamedTuple):
     tau: Array
 
 
+@pytest.mark.slow
 def test_margin_at_a_tick():
     """Issue 20.8: a comparator whose carrier falls back just before it is reached, or just beyond, as it may be."""
 

@@ -56,13 +56,8 @@ def exact():
     return np.array([*ref.y, *events[:3]]), derivative, len(events)
 
 
-@pytest.mark.parametrize(
-    "solver, order",
-    [
-        (dfx.Tsit5(), 5),
-        *(pytest.param(s, n, marks=pytest.mark.slow) for s, n in ((dfx.Dopri5(), 5), (dfx.Dopri8(), 8))),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("solver, order", [(dfx.Tsit5(), 5), (dfx.Dopri5(), 5), (dfx.Dopri8(), 8)])
 def test_errors_fall_with_the_tolerance(solver, order, exact):
     """State, event times and their derivatives by state and parameters after thirty events: the error falls as the
     tolerance (and so as the length of the steps to the power of the order), down to 1e-11; pitfall 19."""
@@ -215,7 +210,7 @@ def second(system, events):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "crossing")) for name in FLOWS]
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("crossing", "impact"))) for name in FLOWS]
 )
 def test_second_derivatives_by_closed_forms(name):
     """Pitfall 20: through a crossing, the start and the end of sliding, static breakaway, an impact; and of the times of

@@ -148,6 +148,7 @@ def stick_slip(v):
     return jnp.stack(sol.y1), sol.stats["num_steps"]
 
 
+@pytest.mark.slow  # (by default with the exact flow, test_affine)
 def test_stick_slip():
     """A sweep of the belt's velocity, through up to thirty events, against closed forms; and the derivative by it,
     against forty digits."""

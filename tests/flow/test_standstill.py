@@ -39,7 +39,11 @@ def derivatives(y0, force, solver):
     return jax.jacfwd(lambda y, force: end(y, force, solver=solver), (0, 1), has_aux=True)(y0, force)
 
 
-@pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize(
+    "solver",
+    [*SOLVERS[:2], *(pytest.param(s, marks=pytest.mark.slow) for s in SOLVERS[2:])],
+    ids=lambda s: type(s).__name__,
+)
 def test_at_and_near_an_equilibrium(solver):
     """At rest, within the tolerance of rest, and far from it: lanes of one batch, each with steps of its own."""
     starts = jnp.array([[0.0, 0.0], [1e-12, 0.0], [1e-6, 0.0], [1.0, 0.5]])

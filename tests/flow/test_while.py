@@ -322,6 +322,7 @@ class OneFriction(nsjax.System):
         return y
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("z, force", [(1.0, 0.3), (3.0, 0.8)])
 def test_the_surface_of_another_one_is_met_alone(z, force):
     """What is not there shares no surface, though its h is zero where that of another switch is."""

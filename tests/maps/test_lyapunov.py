@@ -83,6 +83,7 @@ class Driven(nsjax.System):
         return self.stick
 
 
+@pytest.mark.slow
 def test_the_tent_map():
     """To rounding; as lanes; and the determinants of its resets have the same sum."""
 

@@ -290,6 +290,7 @@ def turned():
     return orbit_of(Turned(), Motion(1.0, 0.2), period=12.0)
 
 
+@pytest.mark.slow
 def test_a_branch_with_falling_friction(turned):
     """It ended after a millionth of the interval, as Newton's method came to both sides of the surface."""
     branch = continue_orbit(Turned(), turned, "v_dr", (0.19, 0.21), max_branches=1, max_step=0.1)
@@ -300,6 +301,7 @@ def test_a_branch_with_falling_friction(turned):
         np.testing.assert_allclose(branch.periods[i], period_of(branch.values[i]), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_continuation_that_is_kept_knows_them(turned, tmp_path):
     """In its equations, before it is written and when it is read."""
     system = Turned()
