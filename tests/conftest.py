@@ -27,11 +27,6 @@ matplotlib.use("Agg")
 gc.set_threshold(100_000, 20, 20)  # tracing makes many objects, and looking through them takes a fifth of its time
 
 
-if sys.platform == "linux":  # memory that is freed is kept, as the next program needs as much: `forget` gives it back
-    for option, value in ((-1, 2**30), (-2, 2**26), (-3, 2**25)):  # M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD
-        ctypes.CDLL("libc.so.6").mallopt(option, value)
-
-
 MUCH = 1.2e9  # bytes of a process from which on it forgets between two files
 MOST, MORE = 1.6e9, 6e8  # and between two tests of a file too, if it has grown
 kept = [0]  # bytes that were left then, of which the system gets nothing back

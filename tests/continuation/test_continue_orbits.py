@@ -48,15 +48,11 @@ GAPS = np.array([1.5, 2.0, 0.5, 5.0])  # at the third the wall is hit: no orbit 
 
 
 @pytest.fixture(scope="module")
-def begun():
+def walls():
     """Searches one after the other are a smaller program than `sweep`, which `duffing` below has."""
     found = [find_orbit(Wall(gap=jnp.asarray(gap)), Motion(1.05, 0.0), order=1, **HOW) for gap in GAPS]
-    return jax.tree.map(lambda *each: jnp.stack(each), *found)
-
-
-@pytest.fixture(scope="module")
-def walls(begun):
-    return begun, continue_orbits(begun, "omega", (0.1, 1.5))
+    orbits = jax.tree.map(lambda *each: jnp.stack(each), *found)
+    return orbits, continue_orbits(orbits, "omega", (0.1, 1.5))
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +102,6 @@ def test_grazing(walls):
         assert np.isnan(branches.values[lane, n:]).all() and not branches.stable[lane, n:].any()
 
 
-@pytest.mark.slow  # (a notebook follows many branches)
 def test_closed_forms(walls):
     _, branches = walls
     omega, real = branches.values, ~np.isnan(branches.values)
@@ -195,13 +190,12 @@ def test_infinitely_unstable_fold():
         (dict(interval=(3.0, 4.0)), "within `interval`"),
     ],
 )
-def test_mistakes(begun, change, message):
+def test_mistakes(walls, change, message):
     arguments = dict(parameter="omega", interval=(0.1, 1.5)) | change
     with pytest.raises(ValueError, match=message):
-        continue_orbits(begun, **arguments)
+        continue_orbits(walls[0], **arguments)
 
 
-@pytest.mark.slow
 def test_printed(walls):
     text = str(walls[1])
     assert "4 branches of periodic orbits of Wall" in text and "3 ends: grazing of wall" in text

@@ -59,7 +59,6 @@ def heard(monkeypatch):
     return calls
 
 
-@pytest.mark.slow
 def test_a_parameter_that_is_not_free_may_have_no_derivative(heard):
     """Zero times an infinite derivative is no part of an answer: another program finds it. A linear field goes by
     exponentials, of which programs are small."""

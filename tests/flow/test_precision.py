@@ -115,7 +115,6 @@ def test_smallest_tolerance_of_single_precision():
 LONG = dict(stepsize_controller=pid(1e-10), max_steps=200_000, max_events=2048)
 
 
-@pytest.mark.slow
 def test_late_start():
     """Pitfall 28: from t = 1e6 as from 0, where a unit in the last place is 1e-10."""
     exact = reference.simulate(reference.StickSlip(), 60.0, (2.5, -0.5))

@@ -239,7 +239,6 @@ def test_no_orbit_at_all():
     )
 
 
-@pytest.mark.slow  # (by default in reverse mode, below)
 def test_smooth_autonomous_orbit_and_its_derivatives():
     """Period 2 π / w and r = √μ; derivatives of the period, the state and the multipliers by parameters."""
 

@@ -21,7 +21,7 @@ def unstable(v_dr, segments=REPELS, y0=None, **change):
     return find_orbit(system, y0 or Motion(1.0, -1.15 * v_dr), segments=segments, throw=False, **METHOD)
 
 
-@pytest.mark.slow  # (by default the command line finds it, and the unstable orbits below)
+@pytest.mark.slow  # (by default unstable orbits are found so, below)
 def test_section_3_4():
     orbit = find_orbit(gallery.StickSlip(), Motion(2.02, 0.0), period=13.54, method="segments", **METHOD)
     exact = reference.stick_slip_orbit()

@@ -12,19 +12,19 @@ import nsjax
 from nsjax import find_orbit, gallery, RESULTS
 
 
-pytestmark = pytest.mark.slow  # (by default: test_orbit, the command line, and the notebooks of the chapters)
 METHOD = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-13), max_steps=8192, max_events=16)
 
 
-def cases(system, reference, keys):
-    return [pytest.param(system, reference, key, id=f"{system.__name__}-{key}") for key in keys]
+def cases(system, reference, keys, slow):
+    mark = (pytest.mark.slow,) if slow else ()
+    return [pytest.param(system, reference, key, marks=mark, id=f"{system.__name__}-{key}") for key in keys]
 
 
 SHOTS = (
-    *cases(Stop, orbit_reference.impact_orbit, orbit_reference.IMPACT),
-    *cases(gallery.ForcedStickSlip, orbit_reference.forced_stick_slip_orbit, orbit_reference.STICK_SLIP),
-    *cases(gallery.ForcedFriction, orbit_reference.friction_orbit, orbit_reference.FRICTION),
-    *cases(gallery.Trilinear, orbit_reference.trilinear_orbit, orbit_reference.TRILINEAR),
+    *cases(Stop, orbit_reference.impact_orbit, orbit_reference.IMPACT, False),
+    *cases(gallery.ForcedStickSlip, orbit_reference.forced_stick_slip_orbit, orbit_reference.STICK_SLIP, True),
+    *cases(gallery.ForcedFriction, orbit_reference.friction_orbit, orbit_reference.FRICTION, True),
+    *cases(gallery.Trilinear, orbit_reference.trilinear_orbit, orbit_reference.TRILINEAR, True),
 )
 
 
@@ -52,12 +52,14 @@ def test_shooting(system, reference, key):
     check(search(system, shot), shot)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system, reference, key", SHOTS)
 def test_segments(system, reference, key):
     shot = reference(key)
     check(search(system, shot, method="segments"), shot)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["shooting", "segments"])
 def test_section_5_7(method):
     """Eight kinks in a period; size, but not period, in proportion to μ."""
@@ -83,6 +85,7 @@ GRADIENTS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["shooting", "segments"])
 @pytest.mark.parametrize("system, shot, names", GRADIENTS, ids=[case[0].__name__ for case in GRADIENTS])
 def test_gradients(system, shot, names, method):
@@ -108,6 +111,7 @@ def test_gradients(system, shot, names, method):
     np.testing.assert_allclose(derivative / size, exact / size, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_order_is_found_out():
     """The subharmonic from nothing but a start: followed to where it settles, it repeats itself after two periods."""
     shot = orbit_reference.impact_orbit("subharmonic")
@@ -120,6 +124,7 @@ def test_order_is_found_out():
     assert len(free.events) == 0
 
 
+@pytest.mark.slow
 def test_grazing():
     """Pitfall 10: the linear orbit's amplitude is just the gap. By segments, with an impact of velocity zero, that is
     well-posed: the Jacobian of the equations is regular, and only the monodromy matrix does not exist."""
