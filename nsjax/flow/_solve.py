@@ -81,7 +81,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
     model = SwitchedSystem(system.assembled(), direction, start, y0).at(start)
-    state, forked, result = start_mode(model, start, y0, options.given, frozen(stop - start))
+    state, values, forked, result = start_mode(model, start, y0, options.given, frozen(stop - start))
     # (To end on a surface is not plain: none of a map's solutions would be.)
     plain = options.plain and not any(switch.ends for switch in model.switches)
     exact = (plain or isinstance(options.integrator.solver, Affine)) and allows(model, options.meter, state, start, y0)
@@ -89,10 +89,11 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     if plain:
         options = options._replace(integrator=options.integrator._replace(solver=Affine()))
     stepper = _stepper(options.integrator).made_for(model, state, start, y0)
-    y0 = model.project(start, y0, state)  # a change of y0 off the surface that holds it changes nothing
+    y0 = model.project(start, y0, state, values)  # a change of y0 off the surface that holds it changes nothing
+    f0 = model.flow(start, y0, state)
     flow = _flow(model, stepper, (start, stop), y0, state, options)
-    result = _obstacle(flow, y0, state, options.saveat, result)
-    carry = _first_turn(flow, y0, state, forked, result, options)
+    result = _obstacle(flow, y0, f0, options.saveat, result)
+    carry = _first_turn(flow, y0, f0, state, forked, result, options)
     carry = _tied(jax.tree.map(_strong, carry), (system, t0, t1, y0))
     c = exactly(flow, carry, plain) if exact else _looped(flow, carry, options.integrator.adjoint)
     sol = _solution(flow, c, t0, state, Request.of(options.saveat).t1)
@@ -139,7 +140,7 @@ def _flow(
     )
 
 
-def _obstacle(flow: Flow, y: Y, state: ModeState, saveat: dfx.SaveAt, result: RESULTS) -> RESULTS:
+def _obstacle(flow: Flow, y: Y, f: Y, saveat: dfx.SaveAt, result: RESULTS) -> RESULTS:
     """What keeps a solution from setting out, if anything does."""
     model, t0, t1, ts = flow.model, flow.t0, flow.t1, Request.of(saveat).ts
     for _, _, good, _ in [law for switch in model.switches for law in switch.laws(model.system)]:
@@ -148,7 +149,7 @@ def _obstacle(flow: Flow, y: Y, state: ModeState, saveat: dfx.SaveAt, result: RE
         result = RESULTS.where(model.countable(t * model.direction), result, RESULTS.clock_too_fast)
     for closes in closing_contacts(model, t0, y).values():
         result = RESULTS.where(closes, RESULTS.wrong_contact, result)
-    good = finite((y, model.flow(t0, y, state), t0, t1))
+    good = finite((y, f, t0, t1))
     result = RESULTS.where(good, result, RESULTS.nonfinite_field)
     if ts is not None and len(ts):
         ordered = times_in_order(ts.astype(t0.dtype), t0 * model.direction, t1 * model.direction)
@@ -156,7 +157,7 @@ def _obstacle(flow: Flow, y: Y, state: ModeState, saveat: dfx.SaveAt, result: RE
     return result
 
 
-def _first_turn(flow: Flow, y: Y, state: ModeState, forked: Any, result: RESULTS, options: _Options) -> Carry:
+def _first_turn(flow: Flow, y: Y, f: Y, state: ModeState, forked: Any, result: RESULTS, options: _Options) -> Carry:
     """What the loop begins with."""
     model, stepper, controller, t = flow.model, flow.stepper, flow.controller, flow.t0
     terms = dfx.ODETerm(lambda t, y, args: model.flow(t, y, state))
@@ -173,7 +174,7 @@ def _first_turn(flow: Flow, y: Y, state: ModeState, forked: Any, result: RESULTS
     return Carry(
         t=t,
         y=y,
-        f=model.flow(t, y, state),
+        f=f,
         state=state,
         dt=lax.stop_gradient(first - t),
         controller=controller_state,

@@ -108,7 +108,7 @@ class PoincareMap(eqx.Module):
         model = SwitchedSystem(still, one, t_still, y_still)
         named = _named(model)
         given = {s.name: given[s.name] for s, may in zip(model.switches, named) if may and s.name in given}
-        state, _, result = start_mode(model, t_still, y_still, given, self.horizon(still, t))
+        state, _, _, result = start_mode(model, t_still, y_still, given, self.horizon(still, t))
         modes = [m.astype(jnp.int32) for m in self.sides(model, t_still, y_still, state)]
         return Start(t, t, y, jnp.stack(modes) if modes else jnp.zeros(0, jnp.int32), result, named)
 

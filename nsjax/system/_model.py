@@ -246,11 +246,15 @@ class SwitchedSystem(Clocked):
 
     def values(self, t: Scalar, y: Y, state: ModeState) -> tuple[Any, ...]:
         """The value of every switch in a mode: signs, and the multipliers λ of those that are held, (2.20)."""
-        return resolved(self._in(state), t, y, state)[0] if self.holdable else self.signs(t, state)
+        return self.values_and_flow(t, y, state)[0] if self.holdable else self.signs(t, state)
 
     def flow(self, t: Scalar, y: Y, state: ModeState) -> Y:
         """The right-hand side in a mode; for a sliding one it is Filippov's field (2.19)."""
-        return resolved(self._in(state), t, y, state)[1]
+        return self.values_and_flow(t, y, state)[1]
+
+    def values_and_flow(self, t: Scalar, y: Y, state: ModeState) -> tuple[tuple[Any, ...], Y]:
+        """Both, worked out once."""
+        return resolved(self._in(state), t, y, state)
 
     def force(self, t: Scalar, y: Y, state: ModeState) -> Scalar:
         """The largest component of the terms that make up the field: with it those which cancel where it is held."""
@@ -264,9 +268,9 @@ class SwitchedSystem(Clocked):
             size = jax.tree.map(lambda a, b: a + jnp.abs(b), size, pull)
         return ft.reduce(jnp.maximum, [jnp.max(x) for x in jax.tree.leaves(size)])
 
-    def project(self, t: Scalar, y: Y, state: ModeState) -> Y:
-        """Removes the drift off the surfaces that hold the solution."""
-        return project(self._in(state), t, y, state) if self.holdable else y
+    def project(self, t: Scalar, y: Y, state: ModeState, s: tuple[Any, ...] | None = None) -> Y:
+        """Removes the drift off the surfaces that hold the solution. `s`: the values there, if they are known."""
+        return project(self._in(state), t, y, state, s) if self.holdable else y
 
     # Guards: positive while the mode lasts. Slot i is the maximum over the last axis, so that the event is the
     # instant at which all of its entries have become non-positive.

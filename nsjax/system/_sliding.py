@@ -110,7 +110,7 @@ def resolved(model: "SwitchedSystem", t: Scalar, y: Y, state: ModeState) -> tupl
     return s, model.field(t, y, s)
 
 
-def project(model: "SwitchedSystem", t: Scalar, y: Y, state: ModeState) -> Y:
+def project(model: "SwitchedSystem", t: Scalar, y: Y, state: ModeState, s: tuple[Any, ...] | None = None) -> Y:
     """Removes the drift off the surfaces that hold the solution.
 
     The state moves along ∂f/∂s, the direction in which the switch acts, so that the result does not depend on the units
@@ -118,7 +118,10 @@ def project(model: "SwitchedSystem", t: Scalar, y: Y, state: ModeState) -> Y:
     quadratic in a drift that is itself of the order of the local error.
     """
     which = model.holdable
-    s = model.signs(t, state) if model.jointly_affine and not model.contacts else model.values(t, y, state)
+    if model.jointly_affine and not model.contacts:
+        s = model.signs(t, state)
+    elif s is None:
+        s = model.values(t, y, state)
     held = row([model.held(k, state.mode[k]) for k in which])
     near = linearised(model, t, y, state, s)
 

@@ -23,9 +23,10 @@ AT_ONCE = 0.01  # times the root of eps and of the time to be solved for: what i
 
 def start_mode(
     model: SwitchedSystem, t: Scalar, y: Y, given: dict[str, Any], horizon: Scalar
-) -> tuple[ModeState, Bool[Array, ""], RESULTS]:
-    """The mode in which the solution sets out: from the signs of h, from `mode=`, and on a surface by the fields; and
-    whether another solution sets out there too. `horizon`: for how long it is to be solved."""
+) -> tuple[ModeState, tuple[Any, ...], Bool[Array, ""], RESULTS]:
+    """The mode in which the solution sets out: from the signs of h, from `mode=`, and on a surface by the fields; the
+    values of the switches in it; and whether another solution sets out there too. `horizon`: for how long it is to be
+    solved."""
     start = _Start(model, t, y, given, horizon)
     counts = model.counts(t)
     for k, switch in enumerate(model.switches):
@@ -47,7 +48,8 @@ def start_mode(
         forked = forked | (model.held(k, state.mode[k]) & (model.direction < 0))
     result = RESULTS.where(unsure, RESULTS.repulsive_sliding, start.result)
     result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
-    return state._replace(roots=tuple(start.roots_there(state))), forked, result
+    roots, values = start.roots_and_values(state)
+    return state._replace(roots=tuple(roots)), values, forked, result
 
 
 class _Start:
@@ -146,13 +148,13 @@ class _Start:
             failure = RESULTS.start_penetrates if contact else RESULTS.wrong_mode
             self.result = RESULTS.where(off, failure, self.result)
 
-    def roots_there(self, state: ModeState) -> list[Any]:
-        """Guards of surfaces on which the start lies have a root there already."""
+    def roots_and_values(self, state: ModeState) -> tuple[list[Any], tuple[Any, ...]]:
+        """Guards of surfaces on which the start lies have a root there already. And the values of the switches."""
         # Without this the first step would find the start itself as an event. A root is simple where the field crosses
         # the surface and double where it is tangent; more than two cannot be told apart.
         model, t, y, roots = self.model, self.t, self.y, list(state.roots)
-        f = model.flow(t, y, state)
-        for k, value in enumerate(frozen(model.values(t, y, state))):
+        values, f = model.values_and_flow(t, y, state)
+        for k, value in enumerate(frozen(values)):
             if model.static(k) and k in model.holdable:
                 edge = select(model.direction < 0, model.edge(k, value, nearly(t)), 0)
                 roots[k] = select((state.mode[k] == 0) & ((k in self.chosen) | ~self.at[k]), edge, roots[k])
@@ -166,4 +168,4 @@ class _Start:
                 sign = select(sign == OFF, 0, sign)
             settled = jnp.zeros((), bool) if k in self.chosen else self.at.get(k, jnp.zeros((), bool))
             roots[k] = select(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
-        return roots
+        return roots, values

@@ -107,11 +107,9 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
     args = (model, t, y, f0, state)
     frozen_model, start, y_start, f_start, _ = frozen(args)
 
-    def flow(t: Scalar, y: Y) -> Y:
-        return frozen_model.flow(t, y, state)
-
-    def guards(t: Scalar, y: Y) -> Array:
-        return model.stacked(frozen_model.guards(t, y, state), -1.0)
+    def both(t: Scalar, y: Y) -> tuple[Y, Array]:
+        s, f = frozen_model.values_and_flow(t, y, state)
+        return f, model.stacked(frozen_model.guards(t, y, state, s=s), -1.0)
 
     # A multiplier that stays at its bound, or a guard which begins with a double root, has no sign if it does not rise
     # above rounding on the whole step.
@@ -126,9 +124,8 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
     guess = start + select(met, jnp.minimum(earliest, 1), select(turns[nearest], low[nearest], 1)) * length
 
     y_guess = stepper(frozen_model, state, start, guess, y_start, f_start).y1
-    f = flow(guess, y_guess)
-    one = jnp.ones_like(guess)
-    values, rates = jax.jvp(guards, (guess, y_guess), (one, f))
+    f = frozen_model.flow(guess, y_guess, state)
+    (_, values), (bend, rates) = jax.jvp(both, (guess, y_guess), (jnp.ones_like(guess), f))
     part = jnp.argmax(values, axis=-1)
     value = jnp.take_along_axis(values, part[:, None], axis=-1)[:, 0]
     rate = jnp.take_along_axis(rates, part[:, None], axis=-1)[:, 0]
@@ -152,7 +149,6 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
         missed = select(falls_on, jnp.minimum(missed, value), missed)
     te = jnp.clip(guess + shift[slot], start, start + length)
     dt = te - guess
-    bend = jax.jvp(flow, (guess, y_guess), (one, f))[1]
     y_end = jax.tree.map(lambda y, f, b: y + dt * (f + 0.5 * dt * b), y_guess, f, bend)
     te, y_end = _arrival(te, y_end, stepper, (*args, slot, part[slot], met))
     # At the very start of the step the event is a consequence of the one before: it has the same time and derivative.
@@ -191,22 +187,26 @@ def transversality(
     model, t, y = frozen((model, t, y))
     flat, unravel = jfu.ravel_pytree(y)
 
-    def guards(t: Scalar, x: Array) -> Float[Array, " slots"]:
-        return model.stacked(model.guards(t, unravel(x), state), -1.0)[np.arange(len(model.slots)), part]
+    def guards(t: Scalar, x: Array) -> tuple[Float[Array, " slots"], Array]:
+        """And the field."""
+        s, f = model.values_and_flow(t, unravel(x), state)
+        rows = model.stacked(model.guards(t, unravel(x), state, s=s), -1.0)
+        return rows[np.arange(len(model.slots)), part], jfu.ravel_pytree(f)[0]
 
     rtol, atol = tolerance
-    f, error = jfu.ravel_pytree(model.flow(t, y, state))[0], atol + rtol * jnp.abs(flat)
+    error = atol + rtol * jnp.abs(flat)
     if not seen:
-        h_t, n = jax.jacfwd(guards, argnums=(0, 1))(t, flat)
+        (h_t, n), f = jax.jacfwd(guards, argnums=(0, 1), has_aux=True)(t, flat)
         return jax.vmap(cosine, (0, 0, None))(h_t, n, f), jnp.abs(n) @ error
     table = np.array(seen)
     number = np.arange(len(flat))
     seeds = jnp.asarray([np.isin(number, column) for column in table.T], flat.dtype)
 
-    def moved(dt: Scalar, dx: Array) -> Float[Array, " slots"]:
-        return jax.jvp(guards, (t, flat), (dt, dx))[1]
+    def moved(dt: Scalar, dx: Array) -> tuple[Float[Array, " slots"], Array]:
+        return jax.jvp(guards, (t, flat), (dt, dx), has_aux=True)[1:]
 
-    h_t, n = moved(jnp.ones_like(t), jnp.zeros_like(flat)), jax.vmap(moved, (None, 0), 1)(jnp.zeros_like(t), seeds)
+    h_t, f = moved(jnp.ones_like(t), jnp.zeros_like(flat))
+    n = jax.vmap(lambda dx: moved(jnp.zeros_like(t), dx)[0], out_axes=1)(seeds)
     n, near = select(table < 0, 0, n), jnp.maximum(table, 0)
     # (Sums of a few columns, written out: XLA's products of so short rows take ten times as long.)
     zero, columns = jnp.zeros_like(h_t), list(zip(n.T, f[near].T, error[near].T))
