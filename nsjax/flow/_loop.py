@@ -150,7 +150,9 @@ class Flow(eqx.Module):
             poor = poor & ~last
             halvings = select(poor, halvings + 1, select(keep, 0, halvings))
             keep = keep & ~poor
-            dt = select(poor, 0.5 * (t_next - c.t), dt)
+            if step.reach is not None:  # the step after it must be resolved as well
+                dt = jnp.minimum(dt, jnp.maximum(step.reach, 0.1) * (t_next - c.t))
+            dt = select(poor, jnp.minimum(dt, 0.5 * (t_next - c.t)), dt)
             # On the last few ulps before the end the polynomials are rounding.
             ahead = t_next - c.t > 4 * eps * jnp.abs(c.t)
             if model.clocks:

@@ -84,6 +84,7 @@ class Step(NamedTuple):
     guards: list[list[list[Scalar]]] = []  # `[slot][part][j]`: coefficients of polynomials that stand for the guards
     noise: list[list[Scalar]] = []  # `[slot][part]`: what rounding of time and state makes of them
     resolved: Bool[Array, ""] | bool = True  # whether they do so well
+    reach: Scalar | None = None  # up to which multiple of this length they would, if a method can tell
     fits: Bool[Array, ""] | bool = True  # whether the method is made for such a field
 
 
@@ -279,7 +280,7 @@ class RungeKutta(Stepper):
         near = jittered(model, state, t, y)
         noise: list[list[Scalar]] = [[] for _ in affine]
         out: list[list[list[Scalar]]] = [[] for _ in affine]
-        resolved = jnp.ones((), bool)
+        resolved, reach = jnp.ones((), bool), None
         if any(affine):
             n = self.degree
             points = self.points(y, step.y1, step.ks)
@@ -307,16 +308,22 @@ class RungeKutta(Stepper):
                 rows = curved(model, state, t, y, step)
             matrix = jnp.asarray(to_bernstein(n), t.dtype)
             coefficients = matrix @ jnp.stack([jnp.stack(values) for values in rows], axis=1)
+            margin = jnp.full_like(t, AMPLE)
             for row, (i, values) in enumerate(zip(which, rows)):
                 # (Not by `jnp.max` of an array: XLA's code for that takes as long as all stages of a step.)
-                last = [sum(float(w) * v for w, v in zip(weights, values)) for weights in to_chebyshev(n)[-2:]]
-                tail, size = (ft.reduce(jnp.maximum, map(jnp.abs, x)) for x in (last, values))
+                rows_of = to_chebyshev(n)[-3:]
+                last = [jnp.abs(sum(float(w) * v for w, v in zip(weights, values))) for weights in rows_of]
+                tail, size = jnp.maximum(*last[1:]), ft.reduce(jnp.maximum, map(jnp.abs, values))
                 # Shortly after a double root or a lift-off all of it is rounding, which a shorter step would not mend.
                 noise[i].append(jnp.abs(near[i][len(out[i])] - values[0]))
-                rough = once(tail - unresolved(t.dtype) * size - noise[i][-1])
-                resolved = resolved & ~(rough > 0)
+                enough = unresolved(t.dtype) * size + noise[i][-1]
+                resolved = resolved & ~(once(tail - enough) > 0)
+                # By symmetry every second coefficient may vanish, which it will not on the next step.
+                tail = jnp.maximum(tail, jnp.sqrt(last[0] * last[2]))
+                margin = once(jnp.minimum(margin, select(AMPLE * tail > enough, enough / tail, AMPLE)))
                 out[i].append(list(coefficients[:, row]))
-        return dict(guards=out, noise=with_multipliers(model, noise), resolved=resolved)
+            reach = 0.9 * margin ** (1 / (n - 1))
+        return dict(guards=out, noise=with_multipliers(model, noise), resolved=resolved, reach=reach)
 
 
 def _sampled(
@@ -337,6 +344,9 @@ def _sampled(
     else:
         rows = [model.guards(t + dt * u, y, state, wanted) for u, y in zip(at, points)]
     return [(i, list(part)) for i, _ in enumerate(wanted) for part in zip(*[row[i] for row in rows])]
+
+
+AMPLE = 1e12  # where so many times less is missing than may be, nothing is said against a longer step
 
 
 def unresolved(dtype: Any) -> float:
