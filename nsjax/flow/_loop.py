@@ -150,9 +150,10 @@ class Flow(eqx.Module):
             poor = poor & ~last
             halvings = select(poor, halvings + 1, select(keep, 0, halvings))
             keep = keep & ~poor
-            if step.reach is not None:  # the step after it must be resolved as well
-                dt = jnp.minimum(dt, jnp.maximum(step.reach, 0.1) * (t_next - c.t))
-            dt = select(poor, jnp.minimum(dt, 0.5 * (t_next - c.t)), dt)
+            length = frozen(t_next - c.t)
+            if step.reach is not None:  # the next must be resolved as well
+                dt = jnp.minimum(dt, jnp.maximum(step.reach, select(poor, 0.1, 1)) * length)
+            dt = select(poor, jnp.minimum(dt, 0.5 * length), dt)
             # On the last few ulps before the end the polynomials are rounding.
             ahead = t_next - c.t > 4 * eps * jnp.abs(c.t)
             if model.clocks:

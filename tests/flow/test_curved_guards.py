@@ -81,3 +81,13 @@ def test_from_long_steps_to_short_ones():
     want = [brentq(packet, *fine[[i, i + 1]], xtol=1e-14) for i in changes]
     assert len(want) == 6
     np.testing.assert_allclose(times(sol), want, atol=1e-11)
+
+
+def test_steps_of_a_given_length():
+    """Stay as they are as long as they are resolved, be it only just; an event begins a new one."""
+    sol = nsjax.solve(
+        Wave(1.0), 0.0, 7.0, 0.5, solver=dfx.Tsit5(), dt0=0.35, stepsize_controller=dfx.ConstantStepSize(), max_events=8
+    )
+    np.testing.assert_allclose(times(sol), np.arange(7) + 0.5, atol=1e-12)
+    # Two up to the first event, three from one to the next, two to the end.
+    assert (sol.stats["num_steps"], sol.stats["num_rejected_steps"]) == (2 + 6 * 3 + 2, 0)

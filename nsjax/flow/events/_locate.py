@@ -107,7 +107,7 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
     args = (model, t, y, f0, state)
     frozen_model, start, y_start, f_start, _ = frozen(args)
 
-    def both(t: Scalar, y: Y) -> tuple[Y, Array]:
+    def field_and_guards(t: Scalar, y: Y) -> tuple[Y, Array]:
         s, f = frozen_model.values_and_flow(t, y, state)
         return f, model.stacked(frozen_model.guards(t, y, state, s=s), -1.0)
 
@@ -125,7 +125,7 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
 
     y_guess = stepper(frozen_model, state, start, guess, y_start, f_start).y1
     f = frozen_model.flow(guess, y_guess, state)
-    (_, values), (bend, rates) = jax.jvp(both, (guess, y_guess), (jnp.ones_like(guess), f))
+    (_, values), (bend, rates) = jax.jvp(field_and_guards, (guess, y_guess), (jnp.ones_like(guess), f))
     part = jnp.argmax(values, axis=-1)
     value = jnp.take_along_axis(values, part[:, None], axis=-1)[:, 0]
     rate = jnp.take_along_axis(rates, part[:, None], axis=-1)[:, 0]
