@@ -137,9 +137,9 @@ class Flow(eqx.Module):
             low = self.survey(step.guards, known)
             is_finite, quiet = low == low, low > 0
             result = RESULTS.where(keep & ~is_finite, RESULTS.nonfinite_field, result)
-            # Why a step is halved: the polynomial of a guard does not stand for it to the precision needed, and roots
-            # found on it would mean nothing. Not for ever: a guard with a kink is never a polynomial, and on a step so
-            # short that rounding of time spoils it no guard is.
+            # Why a step is shortened: the polynomial of a guard does not stand for it to the precision needed, and what
+            # is found on it would mean nothing. Not for ever: a guard with a kink is never a polynomial, and on a step
+            # so short that rounding of time spoils it no guard is.
             eps = float(jnp.finfo(c.t.dtype).eps)
             floor = 4 * eps / unresolved(c.t.dtype) * jnp.maximum(jnp.abs(c.t), self.t1 - self.t0)
             poor = ~step.resolved | _backward(step, known)

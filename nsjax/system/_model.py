@@ -253,7 +253,7 @@ class SwitchedSystem(Clocked):
         return self.values_and_flow(t, y, state)[1]
 
     def values_and_flow(self, t: Scalar, y: Y, state: ModeState) -> tuple[tuple[Any, ...], Y]:
-        """Both, worked out once."""
+        """`values` and `flow`, worked out once."""
         return resolved(self._in(state), t, y, state)
 
     def force(self, t: Scalar, y: Y, state: ModeState) -> Scalar:

@@ -56,13 +56,13 @@ def times(sol):
     return np.array([float(event.t) for event in sol.events])
 
 
-@pytest.mark.parametrize("solver, most", [(dfx.Tsit5(), 4), (dfx.Dopri8(), 3)], ids=["Tsit5", "Dopri8"])
+@pytest.mark.parametrize("solver, most", [(dfx.Tsit5(), 65), (dfx.Dopri8(), 45)], ids=["Tsit5", "Dopri8"])
 def test_steps_follow_the_guard(solver, most):
     """Without a step that is taken twice, from a first one that is far too short."""
     sol = solved(Wave(), 2.0, 0.5, solver)
     np.testing.assert_allclose(times(sol), (np.arange(1, 21) - 0.5) / 10, atol=1e-12)
-    assert sol.stats["num_rejected_steps"] <= 3
-    assert sol.stats["num_steps"] <= most * 20
+    assert sol.stats["num_rejected_steps"] == 0
+    assert sol.stats["num_steps"] <= most
 
 
 def test_steps_grow_again_after_a_kink():
@@ -70,7 +70,7 @@ def test_steps_grow_again_after_a_kink():
     low, high = np.arcsin(0.1), np.arcsin(0.5)
     want = np.sort([2 * np.pi * k + x for k in range(7) for x in (low, high, np.pi - high, np.pi - low)])
     np.testing.assert_allclose(times(sol), want[want < 40.0], atol=1e-11)
-    assert sol.stats["num_steps"] < 70 * 13  # kinks, each of which takes halvings down to rounding
+    assert sol.stats["num_steps"] < 62 * 13  # kinks, each of which takes steps down to rounding
 
 
 def test_from_long_steps_to_short_ones():

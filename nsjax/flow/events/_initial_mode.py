@@ -48,8 +48,8 @@ def start_mode(
         forked = forked | (model.held(k, state.mode[k]) & (model.direction < 0))
     result = RESULTS.where(unsure, RESULTS.repulsive_sliding, start.result)
     result = RESULTS.where(wrong, RESULTS.ambiguous_event, result)
-    roots, values = start.roots_and_values(state)
-    return state._replace(roots=tuple(roots)), values, forked, result
+    values, f = model.values_and_flow(t, y, state)
+    return state._replace(roots=tuple(start.roots_there(state, values, f))), values, forked, result
 
 
 class _Start:
@@ -148,12 +148,12 @@ class _Start:
             failure = RESULTS.start_penetrates if contact else RESULTS.wrong_mode
             self.result = RESULTS.where(off, failure, self.result)
 
-    def roots_and_values(self, state: ModeState) -> tuple[list[Any], tuple[Any, ...]]:
-        """Guards of surfaces on which the start lies have a root there already. And the values of the switches."""
+    def roots_there(self, state: ModeState, values: tuple[Any, ...], f: Y) -> list[Any]:
+        """Guards of surfaces on which the start lies have a root there already. `values` of the switches and field `f`
+        are those of the mode."""
         # Without this the first step would find the start itself as an event. A root is simple where the field crosses
         # the surface and double where it is tangent; more than two cannot be told apart.
         model, t, y, roots = self.model, self.t, self.y, list(state.roots)
-        values, f = model.values_and_flow(t, y, state)
         for k, value in enumerate(frozen(values)):
             if model.static(k) and k in model.holdable:
                 edge = select(model.direction < 0, model.edge(k, value, nearly(t)), 0)
@@ -168,4 +168,4 @@ class _Start:
                 sign = select(sign == OFF, 0, sign)
             settled = jnp.zeros((), bool) if k in self.chosen else self.at.get(k, jnp.zeros((), bool))
             roots[k] = select(here & ~settled & (sign != 0), fresh, roots[k]).astype(jnp.int32)
-        return roots, values
+        return roots

@@ -187,8 +187,7 @@ def transversality(
     model, t, y = frozen((model, t, y))
     flat, unravel = jfu.ravel_pytree(y)
 
-    def guards(t: Scalar, x: Array) -> tuple[Float[Array, " slots"], Array]:
-        """And the field."""
+    def guards_and_field(t: Scalar, x: Array) -> tuple[Float[Array, " slots"], Array]:
         s, f = model.values_and_flow(t, unravel(x), state)
         rows = model.stacked(model.guards(t, unravel(x), state, s=s), -1.0)
         return rows[np.arange(len(model.slots)), part], jfu.ravel_pytree(f)[0]
@@ -196,14 +195,14 @@ def transversality(
     rtol, atol = tolerance
     error = atol + rtol * jnp.abs(flat)
     if not seen:
-        (h_t, n), f = jax.jacfwd(guards, argnums=(0, 1), has_aux=True)(t, flat)
+        (h_t, n), f = jax.jacfwd(guards_and_field, argnums=(0, 1), has_aux=True)(t, flat)
         return jax.vmap(cosine, (0, 0, None))(h_t, n, f), jnp.abs(n) @ error
     table = np.array(seen)
     number = np.arange(len(flat))
     seeds = jnp.asarray([np.isin(number, column) for column in table.T], flat.dtype)
 
     def moved(dt: Scalar, dx: Array) -> tuple[Float[Array, " slots"], Array]:
-        return jax.jvp(guards, (t, flat), (dt, dx), has_aux=True)[1:]
+        return jax.jvp(guards_and_field, (t, flat), (dt, dx), has_aux=True)[1:]
 
     h_t, f = moved(jnp.ones_like(t), jnp.zeros_like(flat))
     n = jax.vmap(lambda dx: moved(jnp.zeros_like(t), dx)[0], out_axes=1)(seeds)
