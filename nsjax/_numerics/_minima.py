@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from .._types import Scalar
 from ._barrier import once
 from ._select import select
+from ._together import together
 
 
 NODES = 40  # parts of a piece: they resolve a phase of 7.6, somewhat more than a period
@@ -78,6 +79,7 @@ def minima(
     x: Float[Array, " n"],
     orders: Float[Array, "2 functions"],
     below: Callable[[Array], Array] = lambda most: jnp.full_like(most, jnp.inf),
+    sums: Any = (),
 ) -> Minima:
     """Follows functions along a path. It is not to be differentiated.
 
@@ -91,14 +93,10 @@ def minima(
     - `x`: the state at the beginning.
     - `orders`: of the zeros that each function must have at both ends, by which it is divided.
     - `below`: what is higher is not looked at between nodes.
+    - `sums`: what is added up before.
     """
-
-    def shapes(x: Array) -> Any:
-        ts, xs, sums = sample(jnp.zeros_like(x[0]), jnp.ones_like(x[0]), x)
-        return ts, xs, sums, functions(ts, xs)[1]
-
-    ts, xs, sums, row = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(shapes, x))
-    top = jnp.full_like(row, jnp.inf)
+    row, ts = jnp.zeros(orders.shape[1], x.dtype), jnp.zeros(NODES + 1, x.dtype)
+    xs, top = jnp.zeros((NODES + 1, *x.shape), x.dtype), jnp.full_like(row, jnp.inf)
     blank = Minima(top, jnp.zeros_like(row), jnp.zeros((*row.shape, *x.shape), x.dtype), -top, sums, ts, xs)
     start = _Walk(jnp.zeros_like(x[0]), jnp.ones_like(x[0]), x, top, blank)
 
@@ -145,7 +143,7 @@ def minima(
 
     # (A function that is NaN counts as resolved, so that the walk ends. The second condition follows from the first:
     # of a loop whose condition depends on one number alone, XLA would look for a count of the turns, which takes long.)
-    return lax.while_loop(lambda walk: (walk.begin < 1) & (walk.width > 0), step, start).minima
+    return lax.while_loop(lambda walk: (walk.begin < 1) & (walk.width > 0), step, together(start)).minima
 
 
 def places_of(rows: list[list[Any]]) -> np.ndarray:

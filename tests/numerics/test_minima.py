@@ -23,7 +23,7 @@ def along(*functions, orders=None, slack=0.0, span=1.0):
         return [jnp.stack(rows)], jnp.full(len(functions), slack)
 
     orders = jnp.zeros((2, len(functions))) if orders is None else orders
-    return jax.jit(lambda: minima(sample, values, jnp.zeros(1), orders))()
+    return jax.jit(lambda: minima(sample, values, jnp.zeros(1), orders, sums=jnp.zeros(())))()
 
 
 def wave(t, peaks):

@@ -71,7 +71,8 @@ def along_segment(curve: OrbitCurve, value: Array, segment: tuple, orders: Array
         # The least value of a guard is of interest where it is about to vanish.
         return select(places < 2 * n, jnp.inf if turns else -jnp.inf, 0.1 * most)
 
-    return in_order(minima(sample, functions, x, orders[:, places], below), places)
+    none = jnp.zeros((2, n), x.dtype)
+    return in_order(minima(sample, functions, x, orders[:, places], below, sums=none), places)
 
 
 def zeros_at_begin(curve: OrbitCurve, itinerary: OrbitItinerary) -> Array:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ...._numerics._select import select
+from ...._numerics._together import together
 from ...._types import Scalar
 from ....orbits.segments._corrector import Plane
 from ....orbits.segments._equations import OrbitCurve
@@ -107,12 +108,11 @@ def follow_lane(
     """The branch from `u` on, to its end, to the first corner, or to `points` points."""
     zero, none = jnp.zeros_like(u[0]), jnp.zeros((), jnp.int32)
     border = jnp.zeros_like(u).at[-1].set(1)
-    blank = jax.eval_shape(
-        lambda: place_of(curve, corrected(curve, itinerary, Plane(u, border, zero), u, turns=False), itinerary, zero)
-    )
-    at = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)._replace(u=u, tangent=border)
-    rows = jax.tree.map(lambda x: jnp.zeros((points, *x.shape), x.dtype), blank.row)
     tests = lane_tests(len(itinerary.slot), len(curve.model.slots))
+    x = jnp.zeros(len(curve.sizes), u.dtype)
+    row = Row(zero, zero, zero, x, u, jax.lax.complex(x, x), jnp.zeros((), bool))
+    at = Place(u, border, zero, jnp.zeros(len(tests), u.dtype), row)
+    rows = jax.tree.map(lambda x: jnp.zeros((points, *x.shape), x.dtype), row)
     ends = jnp.asarray([test != BRANCH and test.kind not in PASSED for test in tests])
     lane = Lane(
         at=at, far=at, bend=jnp.zeros_like(u), length=zero,
@@ -129,7 +129,7 @@ def follow_lane(
         moved = _moved(curve, itinerary, lane, ends, upwards, max_step)
         return jax.tree.map(lambda new, old: select(going(lane), new, old), moved, lane)
 
-    return lax.while_loop(going, step, lane)
+    return lax.while_loop(going, step, together(lane))
 
 
 def _written(lane: Lane, row: Row, arc: Scalar, kind: Any, when: Bool[Array, ""]) -> Lane:
