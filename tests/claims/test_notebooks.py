@@ -18,7 +18,7 @@ def execute(path, monkeypatch, timeout=600):
     # What the tests have compiled, or another notebook, is not compiled again.
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder))
-    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     notebook = nbformat.read(path, as_version=4)
     # The kernel inherits the quick compiler flags of `conftest`, and looks for garbage as seldom as the tests do.
     rarely = ["--IPKernelApp.exec_lines=import gc; gc.set_threshold(100_000, 20, 20)"]
