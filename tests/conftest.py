@@ -49,6 +49,12 @@ def size():
     return int(pathlib.Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
+def pytest_collection_finish():
+    """What is imported by then stays, and need not be looked through again."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forgotten():
     """Programs of one file are of little use to the next; but to drop them takes most of a second."""

@@ -41,6 +41,15 @@ def told(fn, *args):
         return type(error)
 
 
+@pytest.fixture
+def whole_tracebacks():
+    """JAX takes 3 ms for each error to leave its own lines out."""
+    jax.config.update("jax_traceback_filtering", "off")
+    yield
+    jax.config.update("jax_traceback_filtering", "auto")
+
+
+@pytest.mark.usefixtures("whole_tracebacks")
 @pytest.mark.parametrize("promotion", ["standard", "strict"])
 def test_shapes_and_types(promotion):
     with jax.numpy_dtype_promotion(promotion):
