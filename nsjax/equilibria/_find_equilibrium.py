@@ -9,7 +9,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from .._numerics._compile import interactive
+from .._numerics._compile import interactive, on_host
 from .._numerics._jaxpr import is_constant
 from .._numerics._root import Newton
 from .._numerics._select import select
@@ -172,12 +172,14 @@ def _in_all_modes(
     if len(table) > MODES:
         raise ValueError(f"Argument `mode` must leave at most {MODES} modes to be tried, but leaves {len(table)}.")
     number = len(jax.tree.leaves(starts)[0])
-    modes = tuple(jnp.tile(jnp.asarray(column, jnp.int32), number) for column in zip(*table))
-    lanes = jax.tree.map(lambda x: jnp.repeat(x, len(table), axis=0), starts)
+    # With NumPy: of each operation on JAX's arrays a program is made.
+    modes = tuple(np.tile(np.array(column, np.int32), number) for column in zip(*table))
+    lanes = jax.tree.map(lambda x: np.repeat(np.asarray(x), len(table), axis=0), starts)
     batch = _batch(system, t, lanes, modes, newton)
     arrays, static = eqx.partition(batch, eqx.is_array)
     good = np.flatnonzero(np.asarray(batch.result == RESULTS.successful))
-    return [eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static) for i in good]
+    arrays = on_host(arrays)
+    return [eqx.combine(jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), arrays), static) for i in good]
 
 
 @interactive
