@@ -93,7 +93,7 @@ def minima(
     - `x`: the state at the beginning.
     - `orders`: of the zeros that each function must have at both ends, by which it is divided.
     - `below`: what is higher is not looked at between nodes.
-    - `sums`: what is added up before.
+    - `sums`: what the quantities that add up begin with, as a rule zeros.
     """
     row, ts = jnp.zeros(orders.shape[1], x.dtype), jnp.zeros(NODES + 1, x.dtype)
     xs, top = jnp.zeros((NODES + 1, *x.shape), x.dtype), jnp.full_like(row, jnp.inf)

@@ -1,7 +1,7 @@
 """Values of which a batch has all or none.
 
-Which of a loop's values differ from lane to lane `vmap` finds out by tracing the body again and again, and the loops
-within it each time, until no further one does. If they all do from the beginning, it traces the body once.
+`vmap` finds out which values of a loop differ from lane to lane by tracing the body again and again, each time with the
+loops within it, until no further value does. If all of them do from the beginning, it traces the body once.
 """
 
 from typing import Any, TypeVar
@@ -19,8 +19,8 @@ together_p.multiple_results = True
 
 
 def together(tree: T) -> T:
-    """The same arrays. Under `vmap`, if any of them differs from lane to lane, each has a value for every lane. Their
-    derivatives are kept together apart from them."""
+    """The same arrays; under `vmap` each has a value for every lane, if any of them has. What is so of the values need
+    not be of their derivatives: a batch of directions gives lanes to the derivatives alone."""
     flat, form = jax.tree.flatten(tree)
     return jax.tree.unflatten(form, together_p.bind(*map(jnp.asarray, flat)) if flat else [])
 

@@ -172,14 +172,14 @@ def _in_all_modes(
     if len(table) > MODES:
         raise ValueError(f"Argument `mode` must leave at most {MODES} modes to be tried, but leaves {len(table)}.")
     number = len(jax.tree.leaves(starts)[0])
-    # With NumPy: of each operation on JAX's arrays a program is made.
+    # With NumPy, as JAX compiles a program for each operation.
     modes = tuple(np.tile(np.array(column, np.int32), number) for column in zip(*table))
     lanes = jax.tree.map(lambda x: np.repeat(np.asarray(x), len(table), axis=0), starts)
     batch = _batch(system, t, lanes, modes, newton)
     arrays, static = eqx.partition(batch, eqx.is_array)
     good = np.flatnonzero(np.asarray(batch.result == RESULTS.successful))
-    arrays = on_host(arrays)
-    return [eqx.combine(jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), arrays), static) for i in good]
+    each = on_host(arrays)
+    return [eqx.combine(jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), each), static) for i in good]
 
 
 @interactive

@@ -44,9 +44,10 @@ def told(fn, *args):
 @pytest.fixture
 def whole_tracebacks():
     """JAX takes 3 ms for each error to leave its own lines out."""
+    before = jax.config.jax_traceback_filtering  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_traceback_filtering", "off")
     yield
-    jax.config.update("jax_traceback_filtering", "auto")
+    jax.config.update("jax_traceback_filtering", before)
 
 
 @pytest.mark.usefixtures("whole_tracebacks")

@@ -71,8 +71,8 @@ def along_segment(curve: OrbitCurve, value: Array, segment: tuple, orders: Array
         # The least value of a guard is of interest where it is about to vanish.
         return select(places < 2 * n, jnp.inf if turns else -jnp.inf, 0.1 * most)
 
-    none = jnp.zeros((2, n), x.dtype)
-    return in_order(minima(sample, functions, x, orders[:, places], below, sums=none), places)
+    found = minima(sample, functions, x, orders[:, places], below, sums=jnp.zeros((2, n), x.dtype))
+    return in_order(found, places)
 
 
 def zeros_at_begin(curve: OrbitCurve, itinerary: OrbitItinerary) -> Array:
