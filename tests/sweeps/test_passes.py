@@ -62,6 +62,20 @@ def test_exact_where_it_is_plain(found):
     np.testing.assert_array_equal(np.asarray(steps == events + 1), PLAIN)
 
 
+def test_single_precision():
+    """Flights that are long are plain in it, too: as many steps as arcs."""
+    e = jnp.asarray([1.0, 0.9, 0.8], jnp.float32)
+    t0, t1, y0 = jnp.float32(0), jnp.float32(4), Motion(jnp.float32(0.5), jnp.float32(0))
+
+    def fly(e):
+        sol = nsjax.solve(Ball(e=e), t0, t1, y0, max_events=32, throw=False)
+        return sol.y1.x, sol.events.num, sol.stats["num_steps"]
+
+    x, events, steps = sweep(fly, e)
+    np.testing.assert_allclose(x, [height(float(e)) for e in e], rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(steps, events + 1)
+
+
 def first(fn, *args):
     """Whether a first pass may leave something over."""
     with first_pass():

@@ -125,8 +125,9 @@ def _rebound(flow: Flow, plan: Plan, constants: Constants, m: Meeting, k: int) -
     flight = 2 * rise / select(pull < 0, -pull, 1)
     brief = jnp.maximum(eps**0.5 * (m.t - flow.t0), 1e4 * eps * jnp.abs(m.t))
     guard = frozen(m.guards[row])
-    noise = 64 * eps * (magnitude(guard, z) + jnp.abs(m.t * rise))
-    long = (pull >= 0) | ((flight > 4 * frozen(brief)) & (0.25 * flight * rise > 1e4 * noise))
+    drift = dot(guard[n:-1], [dot(row, z) for row in m.matrix[n:]])
+    noise = 8 * eps * (magnitude(guard, z) + (0 if drift is None else jnp.abs(m.t * drift)))
+    long = (pull >= 0) | ((flight > 4 * frozen(brief)) & (0.25 * flight * rise > 4e3 * noise))
     sure = (frozen(m.rate) < 0) & (rise > tiny * size) & long & (gain != 0) & (model.direction > 0) & (m.modes[k] == 0)
     for r, others in enumerate(m.guards):
         if r != row:

@@ -76,7 +76,7 @@ def look(plan: Plan, table: Table, lane: Lane, flow: Flow, live: Truths) -> Arc:
         share, doubtful = found.share, found.doubtful
     left, ahead = frozen(span), share * length
     tau = at * ahead
-    slack = LATE * left + 64 * float(jnp.finfo(left.dtype).eps) * jnp.abs(flow.t1)
+    slack = LATE * left + 2 * float(jnp.finfo(left.dtype).eps) * jnp.abs(flow.t1)
     doubtful = doubtful | (event & ((at * share < SOON) | (jnp.abs(tau - left) <= slack)))
     event = event & (tau <= left)
     final = ~event & (ahead >= left) & live
@@ -137,7 +137,7 @@ def turn(problem: Problem, table: Table, lane: Lane) -> Lane:
     if plan.rows:
         met = Meeting(frozen(t), there.z, rows, [*arc.fires], there.rate, guards, lane.modes)
         after = plain(flow, plan, constants, met)
-        sure = sure & (~arc.event | after.sure)
+        sure = sure & (~arc.event | (after.sure & (frozen(t) < flow.t1)))
     # Of a stiff mode an arc is as short as what decays fast is, whether that is still there or not.
     sure = sure & ~(many(flow, arc.length) & (lane.wait > 3 * arc.length))
     # The general flow has the last word on limits.
