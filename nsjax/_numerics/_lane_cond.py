@@ -18,19 +18,21 @@ from ._inner import batched_outputs, mapped, moving, opened, pushed_forward, REA
 from ._select import select
 
 
-_GROUP = 32  # lanes worked on together, at least; a kernel costs as much to start as for some hundred lanes
+FEW = 32  # lanes worked on together, at least, where events are rare among the turns of a loop
+MANY = 64  # where they are not: a kernel costs as much to start as for some hundred lanes
 
 
 compact_cond_p = jex.Primitive("compact_cond")
 compact_cond_p.multiple_results = True
 
 
-def compact_cond(pred: Any, branch: Callable[..., Any], args: Any, default: Any) -> Any:
-    """`branch(*args)` if `pred`, else `default`, both pytrees of arrays of the same structure."""
+def compact_cond(pred: Any, branch: Callable[..., Any], args: Any, default: Any, group: int = FEW) -> Any:
+    """`branch(*args)` if `pred`, else `default`, both pytrees of arrays of the same structure. `group`: how many lanes
+    are worked on together, at least."""
     flat, tree = jax.tree.flatten(args)
     closed, out = jax.make_jaxpr(lambda *xs: branch(*jax.tree.unflatten(tree, xs)), return_shape=True)(*flat)
     other = [jnp.asarray(d, o.dtype) for d, o in zip(jax.tree.leaves(default), jax.tree.leaves(out), strict=True)]
-    results = compact_cond_p.bind(pred, *closed.consts, *flat, *other, jaxpr=opened(closed))
+    results = compact_cond_p.bind(pred, *closed.consts, *flat, *other, jaxpr=opened(closed), group=group)
     return jax.tree.unflatten(jax.tree.structure(out), results)
 
 
@@ -39,17 +41,19 @@ def _split(args: Any, jaxpr: jex.ClosedJaxpr) -> tuple[list, list]:
     return list(args[:n]), list(args[n:])
 
 
-def _impl(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr) -> list[Any]:
+def _impl(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr, group: int) -> list[Any]:
     inputs, default = _split(args, jaxpr)
     return lax.cond(pred, lambda: list(jex.jaxpr_as_fun(jaxpr)(*inputs)), lambda: default)
 
 
-def _gathered(pred: Any, inputs: list, axes: list, default: list, branch: Callable[..., Any]) -> list[Any]:
+def _gathered(
+    pred: Any, inputs: list, axes: list, default: list, branch: Callable[..., Any], least: int
+) -> list[Any]:
     """Runs the branch for the lanes where `pred` holds, group by group."""
     lanes = pred.shape[0]
     # All lanes with work in one group would be an array whose length is not known; groups of one lane a loop as long as
     # their number. An eighth of all lanes makes eight turns where every lane has work, and one where few do.
-    group = min(max(_GROUP, lanes // 8), lanes)
+    group = min(max(least, lanes // 8), lanes)
     # The lanes with work, in order, and then `lanes`, which is dropped.
     rank = jnp.cumsum(pred.astype(jnp.int32))
     total = rank[-1]
@@ -66,7 +70,7 @@ def _gathered(pred: Any, inputs: list, axes: list, default: list, branch: Callab
     return lax.while_loop(lambda carry: carry[0] < total, work, (jnp.zeros((), jnp.int32), default))[1]
 
 
-def _batch(args: Any, dims: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[Any], list[int | None]]:
+def _batch(args: Any, dims: Any, *, jaxpr: jex.ClosedJaxpr, group: int) -> tuple[list[Any], list[int | None]]:
     size = next(x.shape[d] for x, d in zip(args, dims) if d is not None)
     front = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims)]
     batched = [d is not None for d in dims]
@@ -78,22 +82,23 @@ def _batch(args: Any, dims: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[Any], 
             inputs, many = [spread(x, size) for x in inputs], [True] * len(inputs)
         axes = [0 if m else None for m in many]
         default = [x if m else spread(x, size) for x, m in zip(default, many_default)]
-        out = _gathered(pred, inputs, axes, default, branch)
+        out = _gathered(pred, inputs, axes, default, branch, group)
         return out, [0] * len(out)
     # All of this axis has work, or none: the branch becomes a batched one.
     wide = [a or b for a, b in zip(batched_outputs(jaxpr, many), many_default)]
     default = [spread(x, size) if w and not m else x for x, m, w in zip(default, many_default, wide)]
-    return compact_cond(pred, mapped(branch, size, many, wide), inputs, default), [0 if w else None for w in wide]
+    found = compact_cond(pred, mapped(branch, size, many, wide), inputs, default, group)
+    return found, [0 if w else None for w in wide]
 
 
-def _jvp(primals: Any, tangents: Any, *, jaxpr: jex.ClosedJaxpr) -> tuple[list[Any], list[Any]]:
+def _jvp(primals: Any, tangents: Any, *, jaxpr: jex.ClosedJaxpr, group: int) -> tuple[list[Any], list[Any]]:
     pred, (inputs, default) = primals[0], _split(primals[1:], jaxpr)
     moves, default_moves = _split(tangents[1:], jaxpr)
     smooth = moving(moves)
     kept = [i for i, d in enumerate(default) if jnp.issubdtype(d.dtype, jnp.inexact)]
     both = pushed_forward(jex.jaxpr_as_fun(jaxpr), len(inputs), smooth, kept)
     still = [*default, *[ad.instantiate_zeros(default_moves[i]) for i in kept]]
-    results = compact_cond(pred, both, [*inputs, *[moves[i] for i in smooth]], still)
+    results = compact_cond(pred, both, [*inputs, *[moves[i] for i in smooth]], still, group)
     out, change = results[: len(default)], results[len(default) :]
     return out, with_zeros(out, kept, change)
 
@@ -103,7 +108,7 @@ def _reached(have: list[bool], params: Any, outs: int) -> list[bool]:
     return [have[0] or a or b for a, b in zip(batched_outputs(params["jaxpr"], inputs), default)]
 
 
-def _shapes(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr) -> list[Any]:
+def _shapes(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr, group: int) -> list[Any]:
     return list(jaxpr.out_avals)
 
 

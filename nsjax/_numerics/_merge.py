@@ -135,7 +135,7 @@ def _of_compact_cond(graph: Graph, e: Any, ins: list[Value]) -> list[Value]:
     work = _function(branch, results)
 
     def bind(pred: Any, *args: Any) -> list[Any]:
-        return compact_cond(pred, work, list(args[: len(seen)]), list(args[len(seen) :]))
+        return compact_cond(pred, work, list(args[: len(seen)]), list(args[len(seen) :]), e.params["group"])
 
     node = graph.add([pred, *known.packed(given), *own.packed(default)], e, results, {})
     node.bind = bind

@@ -410,4 +410,5 @@ def _landed(pred: Any, flow: Flow, here: tuple, default: Transition) -> Transiti
 
     if flow.reverse:  # `compact_cond` has no rule for transposition
         return eqx.combine(lax.cond(pred, branch, lambda _: dynamic_default, dynamic), static_default)
-    return eqx.combine(compact_cond(pred, branch, (dynamic,), dynamic_default), static_default)
+    landed = compact_cond(pred, branch, (dynamic,), dynamic_default, flow.stepper.group)
+    return eqx.combine(landed, static_default)
