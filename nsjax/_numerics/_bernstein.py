@@ -200,10 +200,11 @@ def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar
         """Whether an interval has no root, and whether it has one that need not be isolated further."""
         positive = [x > 0 for x in local]
         variations = sum((p != q).astype(jnp.int32) for p, q in zip(positive, positive[1:]))
-        single = (variations == 1) & positive[0]
-        others_negative = jnp.sum(ft.reduce(jnp.logical_or, positive)) == 1
+        # Where each part falls once, or is not positive at all, the maximum falls where the last of them does.
+        falls_once = (variations == 1) & positive[0]
+        never = ~ft.reduce(jnp.logical_or, positive)
         begun = ~jnp.any(positive[0])
-        return no_root(local), begun | (jnp.any(single) & others_negative) | (level >= depth)
+        return no_root(local), begun | (jnp.any(falls_once) & jnp.all(falls_once | never)) | (level >= depth)
 
     def busy(state: tuple) -> Bool[Array, ""]:
         _, _, _, free, sure, over = state
@@ -234,10 +235,11 @@ def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar
     level, index, local, free, _, over = jax.lax.while_loop(busy, walk, (zero, zero, a, free, sure, free))
     found = ~over & ~free
     begun = ~jnp.any(local[0] > 0)
-    part = jnp.argmax((local[0] > 0) & (local[-1] <= 0))
-    chosen = [x[part] if len(x) > 1 else x[0] for x in local]
-    polished = found & (chosen[0] > 0) & (chosen[-1] <= 0)
-    place = select(polished, _polish(chosen, polished), select(begun, 0.0, 0.5))
+    falling = found & (local[0] > 0) & (local[-1] <= 0)
+    # (A `vmap` over one part alone would be another program.)
+    places = jax.vmap(_polish)(local, falling) if len(falling) > 1 else _polish([x[0] for x in local], falling[0])
+    last = jnp.max(select(falling, places, 0.0))
+    place = select(jnp.any(falling), last, select(begun, 0.0, 0.5))
     root = (index.astype(dtype) + place) * 0.5 ** level.astype(dtype)
     return found, select(found, root, one)
 

@@ -159,6 +159,27 @@ def test_maximum_of_two_parts():
 KINDS = ("generic", "close pair", "double", "simultaneous", "at t0", "at t1", "cluster")
 
 
+def test_parts_that_fall_once_each():
+    """Their maximum falls to zero with the last of them, however near the others are; a part that is never positive
+    has no say."""
+    rng = np.random.default_rng(1)
+    c = np.sort(rng.normal(size=(400, 3, 6)), axis=-1)[..., ::-1].copy()
+    c[:200, 1] = c[:200, 0] + 1e-9 * rng.normal(size=(200, 1))  # nearly equal
+    c[::4, 2] = -np.abs(c[::4, 2])  # never positive
+    found, root = search(jnp.asarray(c))
+    start, end = c[..., 0].max(axis=1), c[..., -1].max(axis=1)
+    np.testing.assert_array_equal(found, (start <= 0) | (end <= 0))
+    crosses = (start > 0) & (end <= 0)
+    assert crosses.sum() > 100
+    low, high = np.zeros(400), np.ones(400)
+    for _ in range(60):
+        middle = (low + high) / 2
+        above = np.array([max(evaluate(part, u) for part in row) for row, u in zip(c, middle)]) > 0
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    np.testing.assert_allclose(np.asarray(root)[crosses], low[crosses], rtol=0, atol=1e-12)
+    assert np.all(np.asarray(root)[found & (start <= 0)] == 0)
+
+
 def make(count: int, seed: int = 0):
     rng = np.random.default_rng(seed)
     r = rng.uniform(-0.1, 1.1, (count, 3, 4))
