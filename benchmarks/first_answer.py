@@ -2,10 +2,10 @@
 
     python benchmarks/first_answer.py --out benchmarks/first_answer.json
 
-Each row is a process of its own, without programs kept from before, measured `--repeats` times: seconds (median) of the
-import; of tracing, with all else that Python does once; of XLA's compiler (LLVM's for heyoka); of the same call again;
-the largest size of the process; and the ratio of what the first call takes to diffrax's derivative of a solution up to
-one event.
+Each row is a process of its own, without programs kept from before, measured `--repeats` times, or once if its first
+call takes more than ten seconds: seconds (median) of the import; of tracing, with all else that Python does once; of
+XLA's compiler (LLVM's for heyoka); of the same call again; the largest size of the process; and the ratio of what the
+first call takes to diffrax's derivative of a solution up to one event.
 """
 
 import argparse
@@ -23,6 +23,7 @@ import numpy as np
 
 
 UNIT = "diffrax: jacfwd(diffeqsolve) to one event"
+LONG = 10.0  # seconds of a first call that is not repeated
 
 
 def jax_ready() -> Any:
@@ -219,6 +220,8 @@ def main() -> None:
                     break
                 raise SystemExit(f"{name} failed:\n{done.stderr}")
             runs.append(json.loads(done.stdout.splitlines()[-1]))
+            if runs[-1]["first"] > LONG:
+                break
         if not runs:
             print(f"| {name} | not installed | | | | | | |", flush=True)
             continue

@@ -128,7 +128,7 @@ def tabulate(problem: Problem, state: ModeState, key: Lanes) -> Table:
     powers = lax.scan(step, rows, counts)[1]  # (terms, rows, m, lanes)
     weights, lost = economised(DEGREE, _TERMS)
     polynomials = jnp.tensordot(jnp.asarray(weights, x.dtype), powers, axes=1)
-    missed = jnp.tensordot(jnp.asarray(lost, x.dtype), jnp.abs(powers), axes=1)
+    missed = jnp.tensordot(jnp.asarray(lost[DEGREE + 1 :], x.dtype), jnp.abs(powers[DEGREE + 1 :]), axes=1)
     return Table(matrix, guards, projection, jnp.moveaxis(polynomials, 0, 1), missed, length, key)
 
 

@@ -97,8 +97,10 @@ class SegmentFlow(eqx.Module):
         return ts, select(span > 0, xs, x), select(span > 0, sums, 0)
 
 
+@interactive
 def exactness(model: SwitchedSystem, t: Scalar, y: Y) -> int:
-    """Which modes have fields that are affine in the state, with a constant matrix."""
+    """Which modes have fields that are affine in the state, with a constant matrix. (A program without operations: it
+    is asked once of models of one kind.)"""
     zero = jnp.zeros((), jnp.int32)
     parts = tuple(zero if n > 1 else None for n in model.parts)
     state = ModeState(tuple(zero for _ in model.switches), parts, tuple(zero for _ in model.switches))
