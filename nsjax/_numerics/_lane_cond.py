@@ -46,9 +46,7 @@ def _impl(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr, group: int) -> list[Any
     return lax.cond(pred, lambda: list(jex.jaxpr_as_fun(jaxpr)(*inputs)), lambda: default)
 
 
-def _gathered(
-    pred: Any, inputs: list, axes: list, default: list, branch: Callable[..., Any], least: int
-) -> list[Any]:
+def _gathered(pred: Any, inputs: list, axes: list, default: list, branch: Callable[..., Any], least: int) -> list[Any]:
     """Runs the branch for the lanes where `pred` holds, group by group."""
     lanes = pred.shape[0]
     # All lanes with work in one group would be an array whose length is not known; groups of one lane a loop as long as
