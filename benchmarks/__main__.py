@@ -4,6 +4,7 @@ python benchmarks            what is compared with other codes, and how cost gro
 python benchmarks --all      also what accuracy costs, by method: as long again
 """
 
+import argparse
 import pathlib
 import subprocess
 import sys
@@ -11,17 +12,19 @@ import time
 
 
 HERE = pathlib.Path(__file__).parent
-RUNS = [
+RUNS = (
     ("sweep.py", "--out", "sweep.json"),
     ("cost.py", "--out", "cost.json"),
     ("first_answer.py", "--out", "first_answer.json"),
     ("growth.py", "--repeats", "3", "--out", "growth"),
     ("orbits.py", "--out", "orbits.json"),
     ("branches.py", "--repeats", "3", "--out", "branches.json"),
-]
-METHODS = ("work_precision.py", "--out", "work_precision")
+    ("work_precision.py", "--out", "work_precision"),
+)
 
-for script, *options in [*RUNS, METHODS] if "--all" in sys.argv[1:] else RUNS:
+parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+parser.add_argument("--all", action="store_true", help="also what accuracy costs, by method")
+for script, *options in RUNS if parser.parse_args().all else RUNS[:-1]:
     print(f"\n## {script}\n", flush=True)
     start = time.perf_counter()
     subprocess.run([sys.executable, script, *options], cwd=HERE, check=True)
