@@ -236,7 +236,7 @@ def first_root(a: list[Float[Array, " parts"]]) -> tuple[Bool[Array, ""], Scalar
     found = ~over & ~free
     begun = ~jnp.any(local[0] > 0)
     falling = found & (local[0] > 0) & (local[-1] <= 0)
-    # (A `vmap` over one part alone would be another program.)
+    # (Of one part a `vmap` would only add axes.)
     places = jax.vmap(_polish)(local, falling) if len(falling) > 1 else _polish([x[0] for x in local], falling[0])
     last = jnp.max(select(falling, places, 0.0))
     place = select(jnp.any(falling), last, select(begun, 0.0, 0.5))

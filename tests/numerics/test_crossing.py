@@ -154,11 +154,6 @@ def test_maximum_of_two_parts():
     assert no_root(coefficients(jnp.asarray([a, np.ones(3)])))
 
 
-# The property test of the flow: prescribed roots, found by `solve`.
-
-KINDS = ("generic", "close pair", "double", "simultaneous", "at t0", "at t1", "cluster")
-
-
 def test_parts_that_fall_once_each():
     """Their maximum falls to zero with the last of them, however near the others are; a part that is never positive
     has no say."""
@@ -178,6 +173,11 @@ def test_parts_that_fall_once_each():
         low, high = np.where(above, middle, low), np.where(above, high, middle)
     np.testing.assert_allclose(np.asarray(root)[crosses], low[crosses], rtol=0, atol=1e-12)
     assert np.all(np.asarray(root)[found & (start <= 0)] == 0)
+
+
+# The property test of the flow: prescribed roots, found by `solve`.
+
+KINDS = ("generic", "close pair", "double", "simultaneous", "at t0", "at t1", "cluster")
 
 
 def make(count: int, seed: int = 0):

@@ -125,6 +125,7 @@ def _rebound(flow: Flow, plan: Plan, constants: Constants, m: Meeting, k: int) -
     flight = 2 * rise / select(pull < 0, -pull, 1)
     brief = jnp.maximum(eps**0.5 * (m.t - flow.t0), 1e4 * eps * jnp.abs(m.t))
     guard = frozen(m.guards[row])
+    # What ends in rest is for `events/_impact` to tell: four times its margins are asked for.
     drift = dot(guard[n:-1], [dot(row, z) for row in m.matrix[n:]])
     noise = 8 * eps * (magnitude(guard, z) + (0 if drift is None else jnp.abs(m.t * drift)))
     long = (pull >= 0) | ((flight > 4 * frozen(brief)) & (0.25 * flight * rise > 4e3 * noise))
