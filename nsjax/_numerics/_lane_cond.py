@@ -18,15 +18,14 @@ from ._inner import batched_outputs, mapped, moving, opened, pushed_forward, REA
 from ._select import select
 
 
-FEW = 32  # lanes worked on together, at least, where events are rare among the turns of a loop
-MANY = 64  # where they are not: a kernel costs as much to start as for some hundred lanes
+GROUP = 32  # lanes worked on together, at least; a kernel costs as much to start as for some hundred lanes
 
 
 compact_cond_p = jex.Primitive("compact_cond")
 compact_cond_p.multiple_results = True
 
 
-def compact_cond(pred: Any, branch: Callable[..., Any], args: Any, default: Any, group: int = FEW) -> Any:
+def compact_cond(pred: Any, branch: Callable[..., Any], args: Any, default: Any, group: int = GROUP) -> Any:
     """`branch(*args)` if `pred`, else `default`, both pytrees of arrays of the same structure. `group`: how many lanes
     are worked on together, at least."""
     flat, tree = jax.tree.flatten(args)

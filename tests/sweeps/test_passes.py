@@ -63,16 +63,17 @@ def test_exact_where_it_is_plain(found):
 
 
 def test_single_precision():
-    """Flights that are long are plain in it, too: as many steps as arcs."""
-    e = jnp.asarray([1.0, 0.9, 0.8], jnp.float32)
-    t0, t1, y0 = jnp.float32(0), jnp.float32(4), Motion(jnp.float32(0.5), jnp.float32(0))
+    """Flights that are long are plain in it, too, and so is an impact sixteen roundings before the end: as many steps as
+    arcs."""
+    e, t1 = jnp.asarray([[1.0, 0.9, 0.8, 1.0], [4.0, 4.0, 4.0, 1 + 16 * np.finfo(np.float32).eps]], jnp.float32)
+    t0, y0 = jnp.float32(0), Motion(jnp.float32(0.5), jnp.float32(0))
 
-    def fly(e):
+    def fly(e, t1):
         sol = nsjax.solve(Ball(e=e), t0, t1, y0, max_events=32, throw=False)
         return sol.y1.x, sol.events.num, sol.stats["num_steps"]
 
-    x, events, steps = sweep(fly, e)
-    np.testing.assert_allclose(x, [height(float(e)) for e in e], rtol=0, atol=1e-5)
+    x, events, steps = sweep(fly, e, t1)
+    np.testing.assert_allclose(x, [height(float(e), float(t)) for e, t in zip(e, t1)], rtol=0, atol=1e-5)
     np.testing.assert_array_equal(steps, events + 1)
 
 

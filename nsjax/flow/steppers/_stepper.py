@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._numerics._autodiff import frozen
 from ..._numerics._barrier import once
 from ..._numerics._bernstein import binomials, nodes, to_bernstein, to_chebyshev
-from ..._numerics._lane_cond import compact_cond, FEW
+from ..._numerics._lane_cond import compact_cond, GROUP
 from ..._numerics._rolled import rolled
 from ..._numerics._select import select
 from ..._types import Scalar, Y
@@ -107,7 +107,7 @@ class Stepper(eqx.Module):
 
     solver: eqx.AbstractVar[dfx.AbstractSolver]
     degree: eqx.AbstractVar[int]
-    group: ClassVar[int] = FEW  # lanes whose events are worked on together, at least
+    group: ClassVar[int] = GROUP  # lanes whose events are worked on together, at least
 
     def made_for(self, model: SwitchedSystem, state: ModeState, t: Scalar, y: Y) -> "Stepper":
         """The same for this model, or an error if the method cannot be used for it."""

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._numerics._bernstein import binomials
-from ..._numerics._lane_cond import MANY
 from ..._numerics._linalg import row, WRITTEN_OUT
 from ..._numerics._select import select
 from ..._numerics._series import Coefficient, Series
@@ -167,7 +166,7 @@ class TaylorStepper(Stepper):
 
     solver: Taylor
     degree: int = eqx.field(static=True)
-    group: ClassVar[int] = MANY  # of its long steps one in four ends in an event
+    group: ClassVar[int] = 64  # more, as of its long steps one in four ends in an event
 
     def __init__(self, solver: Taylor):
         self.solver = solver
