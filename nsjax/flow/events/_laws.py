@@ -41,7 +41,8 @@ class Instant(NamedTuple):
 
     def only(self, which: list[int]) -> "Instant":
         """The same where no others are at their surfaces."""
-        return self._replace(at={k: self.at[k] for k in which})
+        pairs = {p: pair for p, pair in self.pairs.items() if all(self.model.holdable[i] in which for i in p)}
+        return self._replace(at={k: self.at[k] for k in which}, pairs=pairs)
 
     @property
     def came(self) -> dict[int, Int[Array, ""]]:
