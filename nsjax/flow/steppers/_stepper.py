@@ -306,7 +306,7 @@ class RungeKutta(Stepper):
                     ft.reduce(jnp.logical_or, held), lambda d: curved(*eqx.combine(d, static)), (dynamic,), free
                 )
             else:
-                rows = curved(model, state, t, y, step)
+                rows = once(curved(model, state, t, y, step))  # several kernels use them
             matrix = jnp.asarray(to_bernstein(n), t.dtype)
             coefficients = matrix @ jnp.stack([jnp.stack(values) for values in rows], axis=1)
             margin = jnp.full_like(t, AMPLE)
