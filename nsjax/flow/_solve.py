@@ -34,7 +34,7 @@ from ._results import is_okay, raise_if, RESULTS, SolveError
 from ._save import Log, Request, Saved, times_in_order
 from ._solution import Events, Solution
 from .affine._exact import exactly
-from .affine._plan import allows
+from .affine._plan import planned
 from .events._initial_mode import start_mode
 from .events._locate import seen_numbers
 from .steppers._exponential import AbstractExponential, Affine, ExponentialStepper
@@ -84,8 +84,10 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     state, values, forked, result = start_mode(model, start, y0, options.given, frozen(stop - start))
     # (To end on a surface is not plain: none of a map's solutions would be.)
     plain = options.plain and not any(switch.ends for switch in model.switches)
-    exact = (plain or isinstance(options.integrator.solver, Affine)) and allows(model, options.meter, state, start, y0)
-    plain = plain and exact
+    exact = None
+    if plain or isinstance(options.integrator.solver, Affine):
+        exact = planned(model, options.meter, state, start, y0)
+    plain = plain and exact is not None
     if plain:
         options = options._replace(integrator=options.integrator._replace(solver=Affine()))
     stepper = _stepper(options.integrator).made_for(model, state, start, y0)
@@ -95,7 +97,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     result = _obstacle(flow, y0, f0, options.saveat, result)
     carry = _first_turn(flow, y0, f0, state, forked, result, options)
     carry = _tied(jax.tree.map(_strong, carry), (system, t0, t1, y0))
-    c = exactly(flow, carry, plain) if exact else _looped(flow, carry, options.integrator.adjoint)
+    c = exactly(flow, exact, carry, plain) if exact else _looped(flow, carry, options.integrator.adjoint)
     sol = _solution(flow, c, t0, state, Request.of(options.saveat).t1)
     if plain:  # what fails too is for the second pass to tell
         return sol, ~is_okay(sol.result) | (c.t < flow.t1)

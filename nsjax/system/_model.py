@@ -53,8 +53,11 @@ class SwitchedSystem(Clocked):
     slots: tuple[Slot, ...] = eqx.field(static=True)
     sides: Sides | None = eqx.field(static=True)  # kinks of the field that have the sign of the mode
 
-    def __init__(self, system: System, direction: Any, t: Scalar, y: Y, smooth: bool = False):
-        """`smooth`: whether the field of a mode is to be smooth beyond its surfaces, see `_one_sided`."""
+    def __init__(
+        self, system: System, direction: Any, t: Scalar, y: Y, smooth: bool = False, crossed: tuple[int, ...] = ()
+    ):
+        """`smooth`: whether the field of a mode is to be smooth beyond its surfaces, see `_one_sided`. `crossed`:
+        switches that are taken for some which cannot hold the solution, whether they can or not."""
         super().__init__(system, direction)
         self.sides = None
         self.parts = tuple(len(k.components(system, t, y)) for k in self.switches)
@@ -76,7 +79,8 @@ class SwitchedSystem(Clocked):
         for k, row in zip(hard, self._reach(hard, second, zeros)):
             if row[k]:  # a force that acts on the gap of its own contact
                 reach[k] = row
-        self.holdable = tuple(k for k, n in enumerate(order) if (n == 1 or k in hard) and reach[k, k])
+        may = [(n == 1 or k in hard) and k not in crossed for k, n in enumerate(order)]
+        self.holdable = tuple(k for k in range(len(order)) if may[k] and reach[k, k])
         self.contacts = tuple(k for k in self.holdable if order[k] == 2)
         self.holding = tuple(self.switches[k].holding for k in self.holdable)
 
@@ -110,7 +114,7 @@ class SwitchedSystem(Clocked):
                 if (seen[i] & seen[j]).any()
             )
         # Whether the mode of another one has to do with it: of those whose mode is chosen at an event.
-        free = np.array([k in self.contacts or n == 1 for k, n in enumerate(order)], bool)
+        free = np.array([(k in self.contacts or n == 1) and k not in crossed for k, n in enumerate(order)], bool)
         others = (reach | reach.T) & free & ~np.eye(len(order), dtype=bool)
         self.apart = tuple((~others.any(axis=1)).tolist())
         self.coupling = Coupling.of(reach[np.ix_(self.holdable, self.holdable)], self.pairs)

@@ -363,25 +363,21 @@ def test_two_switches():
     assert np.median(got.stats["num_steps"]) < 0.5 * np.median(want.stats["num_steps"])
 
 
-class Switched(nsjax.System):
-    """A relay, for which there is no such flow."""
+class Ticking(nsjax.System):
+    """A clock, for which there is no such flow."""
 
     def vector_field(self, t, y, s):
-        return 1.0 - 2.0 * s.heater - 0.1 * y
+        return jnp.floor(t) - 0.1 * y
 
-    @nsjax.relay
-    def heater(self, t, y):
-        return 0.5 - y
-
-    @heater.off
-    def heater(self, t, y):
-        return y + 0.5
+    @nsjax.clock
+    def beat(self):
+        return 1.0
 
 
 def test_what_is_left_to_the_general_flow():
     """Models with other switches are solved by the program of `Exponential`; two frequencies are told."""
     sizes = [
-        count(jax.make_jaxpr(lambda m=m: solve(Switched(), 0.0, 5.0, jnp.asarray(0.0), solver=m).y1)())
+        count(jax.make_jaxpr(lambda m=m: solve(Ticking(), 0.0, 5.0, jnp.asarray(0.0), solver=m).y1)())
         for m in (Affine(), Exponential())
     ]
     assert sizes[0] == sizes[1]

@@ -14,9 +14,10 @@ from ..._numerics._lane_cond import compact_cond
 from ..._numerics._lanes import in_lanes
 from ..._numerics._select import select
 from ...system._mode import ModeState
+from ...system._model import SwitchedSystem
 from .._loop import Carry, Flow
-from ._lane import entered, Lane, Lanes, left, logged, MISSING, Row
-from ._plan import constants, made, numbers, Plan, Problem
+from ._lane import entered, Lane, Lanes, left, logged, MISSING, Row, strange
+from ._plan import constants, numbers, Plan, Problem
 from ._table import by_lane, DEGREE, key_of, PHASE, Table, tabulate, THETA
 from ._turn import many, picked, saves, turn
 
@@ -26,12 +27,11 @@ _IN_CACHE = 256, 2**20  # lanes that are run together, at most, and bytes of the
 _IN_MEMORY = 65_536, 2**30  # and on other devices, which want many lanes at once
 
 
-def exactly(flow: Flow, carry: Carry, plain: bool = False) -> Carry:
-    """The end of the loop, as `_solve._looped` finds it, for a model that `_plan.allows`; or if only what is `plain` is
-    wanted, the end of that."""
-    first = carry.state
-    plan = made(flow, first, carry.t, carry.y)
-    kept = min(numbers(flow.model), _KEPT)
+def exactly(flow: Flow, planned: tuple[SwitchedSystem, Plan], carry: Carry, plain: bool = False) -> Carry:
+    """The end of the loop, as `_solve._looped` finds it, for a model as it is `_plan.planned`; or if only what is
+    `plain` is wanted, the end of that."""
+    model, plan = planned
+    kept = min(numbers(model), _KEPT)
     lanes, room = _IN_CACHE if jax.default_backend() == "cpu" else _IN_MEMORY
     size = kept * max(1, len(plan.rows)) * (DEGREE + 1) * plan.width * carry.t.dtype.itemsize
     chunk = max(32, min(lanes, room // size))
@@ -39,17 +39,17 @@ def exactly(flow: Flow, carry: Carry, plain: bool = False) -> Carry:
 
     def run(dynamic: Any) -> Any:
         flow, carry = eqx.combine(dynamic, static)
-        return eqx.filter(_run(flow, plan, kept, carry, plain), eqx.is_array)
+        own = jax.tree.unflatten(jax.tree.structure(model), jax.tree.leaves(flow.model))
+        return eqx.filter(_run(flow, own, plan, kept, carry, plain), eqx.is_array)
 
     return eqx.combine(in_lanes(run, chunk, dynamic), static[1])
 
 
-def _run(flow: Flow, plan: Plan, kept: int, carry: Carry, plain: bool) -> Carry:
-    found = by_lane(lambda flow, y: constants(flow, plan, y), flow, carry.y)
-    problem = Problem(flow, plan, found, carry.y, PHASE if saves(flow) else THETA)
+def _run(flow: Flow, model: SwitchedSystem, plan: Plan, kept: int, carry: Carry, plain: bool) -> Carry:
+    found = by_lane(lambda model, t, y: constants(model, plan, t, y), model, flow.t0, carry.y)
+    problem = Problem(flow, model, plan, found, carry.y, PHASE if saves(flow) else THETA)
     table = _blank(problem, kept, carry)
     lane = entered(problem, table, carry, jnp.full_like(carry.t, jnp.inf))
-    lane = lane._replace(slow=~found.fits)
     used = jnp.zeros_like(carry.steps)
     dynamic, static = eqx.partition((carry, lane, table, used), eqx.is_array)
 
@@ -141,7 +141,7 @@ def _general(problem: Problem, table: Table, carry: Carry, lane: Lane) -> tuple[
     def back(after: Carry, lane: Lane) -> Lane:
         new = entered(problem, table, after, select(waits, after.dt, lane.wait))
         stays = waits & ((after.accepted == lane.accepted) | ~problem.constants.fits)
-        return new._replace(slow=stays & after.active)
+        return new._replace(slow=strange(problem, new.modes, stays) & after.active)
 
     dynamic, static = eqx.partition((carry, lane), eqx.is_array)
 

@@ -21,8 +21,17 @@ Lanes = Float[Array, " lanes"]
 Truths = Bool[Array, " lanes"]
 
 
+class Corner(NamedTuple):
+    """A surface of several components. Where h > 0 its mode ends when the first of them falls, and each is a guard of
+    its own; where h < 0 when the last of them has become positive, and their guards are `joint`."""
+
+    rows: list[int]
+    joint: Truths
+
+
 class Isolated(NamedTuple):
-    """The beginning of an arc on which at most one guard falls to zero, once."""
+    """The beginning of an arc on which at most one guard falls to zero, once; of joint guards the last of those that
+    do."""
 
     share: Lanes  # of the arc
     coefficients: Float[Array, "rows coefficients lanes"]  # there
@@ -34,10 +43,11 @@ class _Look(NamedTuple):
     variations: Int[Array, "rows lanes"]
     begun: Truths  # whether some guard is not positive at the start
     near: Truths  # whether some guard without a root comes near to zero
+    late: Truths  # the same, but not at the start: it may be a root beyond the end, or only coefficients
     many: Truths  # whether more roots than one may be left
 
 
-def _look(a: Array, known: Int[Array, "rows lanes"], size: Array) -> _Look:
+def _look(a: Array, known: Int[Array, "rows lanes"], size: Array, corners: list[Corner]) -> _Look:
     count = a.shape[1]
     # What is known at the start is divided out: that drops the first coefficients.
     first = select(known == 0, a[:, 0], select(known == 1, a[:, 1], select(known == 2, a[:, 2], a[:, 3])))
@@ -48,10 +58,42 @@ def _look(a: Array, known: Int[Array, "rows lanes"], size: Array) -> _Look:
     weights = binomials(count - 1)
     least = ft.reduce(jnp.minimum, [x / w for x, w in zip(kept, weights)])
     largest = ft.reduce(jnp.maximum, [jnp.abs(x) / w for x, w in zip(kept, weights)])
-    near = (variations == 0) & ~(least > NEAR * select(known > 0, largest, size))
-    some = jnp.sum((variations > 0).astype(jnp.int32), axis=0)
-    many = (some > 1) | jnp.any(variations > 1, axis=0)
-    return _Look(variations, jnp.any(~signs[0], axis=0), jnp.any(near, axis=0), many)
+    room = NEAR * select(known > 0, largest, size)
+    close, begun, free = (variations == 0) & ~(least > room), ~signs[0], kept[0] > 2 * room
+    rows = _Look(variations, begun, close & ~free, close & free, variations > 1)
+    event = variations > 0
+    if corners:
+        most = ft.reduce(jnp.maximum, [x / w for x, w in zip(kept, weights)])
+        rows, event = _joined(rows, most < -room, free, corners)
+    some = jnp.sum(event.astype(jnp.int32), axis=0)
+    begun, near, late, many = (jnp.any(x, axis=0) for x in rows[1:])
+    return _Look(rows.variations, begun, near, late, many | (some > 1))
+
+
+def _joined(rows: _Look, below: Array, free: Array, corners: list[Corner]) -> tuple[_Look, Array]:
+    """The same with what is true of joint guards together; and which rows stand for an event.
+
+    They have none as long as one of them stays positive; where each that is positive at first falls once, they have one
+    when the last does. `below`: which guards are clearly negative all along; `free`: clearly positive at the start.
+    """
+    both, either = ft.partial(ft.reduce, jnp.logical_and), ft.partial(ft.reduce, jnp.logical_or)
+    out = [[x[r] for r in range(len(below))] for x in (*rows, rows.variations > 0)]
+    for own, joint in corners:
+        count, begun, near, late, _ = ([x[r] for r in own] for x in rows)
+        clear, falls = ([(n == k) & ~x for n, x in zip(count, begun)] for k in (0, 1))
+        never = [(n == 0) & x for n, x in zip(count, begun)]
+        idle, over = either(clear), both(begun)
+        event = ~idle & ~over & both([x | y for x, y in zip(falls, never)])
+        close = idle & ~either([x & ~y & ~z for x, y, z in zip(clear, near, late)])
+        close = close | (event & either([x & ~below[r] for x, r in zip(never, own)]))
+        apart = either([free[r] for r in own])
+        news = over, close & ~apart, close & apart, ~idle & ~over & ~event
+        for n, r in enumerate(own):
+            one = [(falls[n] & event).astype(count[n].dtype), *news, event & (n == 0)]
+            for column, x in zip(out, one):
+                column[r] = select(joint, x, column[r])
+    *looks, event = map(jnp.stack, out)
+    return _Look(*looks), event
 
 
 def _halved(a: Array) -> Array:
@@ -65,28 +107,32 @@ def _halved(a: Array) -> Array:
 
 
 def isolate(
-    a: Float[Array, "rows coefficients lanes"], known: Int[Array, "rows lanes"], missed: Array, wanted: Truths
+    a: Float[Array, "rows coefficients lanes"],
+    known: Int[Array, "rows lanes"],
+    missed: Array,
+    wanted: Truths,
+    corners: list[Corner],
 ) -> Isolated:
     """**Arguments:** the scaled Bernstein coefficients of the guards on the arc; how many roots each has at its start;
-    what the polynomials may be off; which lanes have work."""
+    what the polynomials may be off; which lanes have work; which guards belong together."""
     weights = jnp.asarray(np.array(binomials(a.shape[1] - 1))[:, None], a.dtype)
     size = jnp.max(jnp.abs(a) / weights, axis=1)
     rough = jnp.any(~(missed <= 1e-6 * size), axis=0)  # a guard that is NaN too
-    seen = _look(a, known, size)
+    seen = _look(a, known, size, corners)
     share = jnp.ones_like(a[0, 0])
 
     def busy(carry: tuple) -> Array:
         depth, _, _, seen = carry
-        return jnp.any(seen.many & ~seen.begun & wanted & ~rough) & (depth < DEPTH)
+        return jnp.any((seen.many | seen.late) & ~seen.begun & wanted & ~rough) & (depth < DEPTH)
 
     def halve(carry: tuple) -> tuple:
         depth, a, share, seen = carry
-        again = seen.many & wanted
+        again = (seen.many | seen.late) & wanted
         a, share = select(again, _halved(a), a), select(again, 0.5 * share, share)
-        return depth + 1, a, share, _look(a, known, size)
+        return depth + 1, a, share, _look(a, known, size, corners)
 
     _, a, share, seen = lax.while_loop(busy, halve, (jnp.zeros((), jnp.int32), a, share, seen))
-    doubtful = seen.many | seen.begun | seen.near | rough
+    doubtful = seen.many | seen.late | seen.begun | seen.near | rough
     return Isolated(share, a, seen.variations > 0, doubtful)
 
 
@@ -98,7 +144,7 @@ def _horner(c: list[Array], x: Array) -> tuple[Array, Array, Array]:
     return value, slope, bend
 
 
-def root(a: Float[Array, "coefficients lanes"], known: Int[Array, " lanes"], wanted: Truths) -> Lanes:
+def root(a: Float[Array, "coefficients *lanes"], known: Int[Array, " *lanes"], wanted: Bool[Array, " *lanes"]) -> Array:
     """The only root on (0, 1] of polynomials with one sign variation, after those known at 0 have been divided out: by
     Halley's method from the eighth of the interval in which it is."""
     n = len(a) - 1

@@ -2,6 +2,7 @@
 of the general flow."""
 
 import dataclasses
+import functools as ft
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,7 +14,9 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._numerics._select import select
 from ..._types import Y
 from ...system._mode import ModeState
-from .._loop import Carry, Flow
+from ...system._model import SwitchedSystem
+from ...system._sgn import sgn
+from .._loop import Carry
 from .._save import Log, Saved
 from ._arc import Rows
 from ._plan import clock, Problem
@@ -34,6 +37,7 @@ class Lane(NamedTuple):
     x: Rows  # the state
     clock: Rows  # S and C, if time enters
     modes: tuple[Numbers, ...]
+    parts: tuple[Numbers | None, ...]  # of each switch with several components the one that is active
     known: list[Numbers]  # how many roots each guard has at this instant
     index: Numbers  # of the table of the mode; MISSING where there is none
     active: Truths
@@ -76,34 +80,36 @@ def found_in(table: Table, modes: tuple[Numbers, ...], like: Numbers) -> Numbers
 
 def entered(problem: Problem, table: Table, c: Carry, wait: Lanes) -> Lane:
     """From the general flow."""
-    flow, plan, constants, _, _ = problem
+    flow, model, plan, constants, _, _ = problem
     known = [jnp.zeros_like(c.steps)] * len(plan.rows)
-    if flow.model.slots:
+    if model.slots:
 
-        def roots(flow: Flow, state: ModeState) -> list[Array]:
-            found, out = flow.model.known_roots(state), []
-            for row in plan.rows:
-                free, held = ([None] if i is None else found[i] for i in (row.free, row.held))
-                if free[0] is not None and held[0] is not None:
-                    out.append(select(flow.model.held(row.switch, state.mode[row.switch]), held[0], free[0]))
+        def roots(model: SwitchedSystem, state: ModeState) -> list[Array]:
+            found, out = dict(zip(model.slots, model.known_roots(state))), []
+            for k, free, held in plan.rows:
+                if free and held:
+                    out.append(select(model.held(k, state.mode[k]), found[held][0], found[free][0]))
+                elif free and model.parts[k] > 1:  # those below a corner belong to the slot of its first component
+                    below = found[model.slots[_first(model, k)]][free.part]
+                    out.append(select(state.mode[k] < 0, below, found[free][0]))
                 else:
-                    out.append(held[0] if free[0] is None else free[0])
+                    out.append(found[free or held][0])
             return out
 
-        known = by_lane(roots, flow, c.state)
+        known = by_lane(roots, model, c.state)
     since = clock(c.t - flow.t0, constants.frequency) if plan.timed else ()
-    no = jnp.zeros_like(c.active)
     return Lane(
         t=c.t,
         x=rows_of(c.y),
         clock=list(since),
         modes=c.state.mode,
+        parts=c.state.part,
         known=[k.astype(jnp.int32) for k in known],
         index=found_in(table, c.state.mode, c.steps),
         active=c.active,
-        slow=no,
+        slow=strange(problem, c.state.mode, ~constants.fits),
         wait=wait,
-        moved=no,
+        moved=jnp.zeros_like(c.active),
         steps=c.steps,
         accepted=c.accepted,
         events=c.events,
@@ -113,21 +119,31 @@ def entered(problem: Problem, table: Table, c: Carry, wait: Lanes) -> Lane:
     )
 
 
+def _first(model: SwitchedSystem, k: int) -> int:
+    return next(i for i, slot in enumerate(model.slots) if slot.switch == k)
+
+
+def strange(problem: Problem, modes: tuple[Numbers, ...], also: Truths) -> Truths:
+    """Where a mode is none of those with a table, as it holds what is only crossed here; and `also` others."""
+    own = [k for k in problem.plan.crossed if isinstance(problem.model.switches[k], sgn)]
+    return ft.reduce(jnp.logical_or, [modes[k] == 0 for k in own], also)
+
+
 def left(problem: Problem, lane: Lane, c: Carry, dt: Lanes) -> Carry:
     """To the general flow: `c` is what it had last, `dt` the step that it is to take."""
     flow, plan = problem.flow, problem.plan
     y, roots = state_of(lane.x, c.y), []
     for k in range(len(lane.modes)):
-        own = [(row, known) for row, known in zip(plan.rows, lane.known) if row.switch == k]
-        if k in flow.model.holdable:
+        own = [lane.known[r] for r in plan.of(k)]
+        if k in problem.model.holdable:
             held = flow.model.held(k, lane.modes[k])
-            edge = own[0][1] - (own[1][1] if len(own) > 1 else 0)
-            roots.append(select(held, edge, own[0][1]))
+            edge = own[0] - (own[1] if len(own) > 1 else 0)
+            roots.append(select(held, edge, own[0]))
         else:
-            roots.append(own[0][1])
+            roots.append(ft.reduce(jnp.maximum, own))
     kept = [select(lane.moved, new, old).astype(jnp.int32) for new, old in zip(roots, c.state.roots)]
-    state = ModeState(lane.modes, c.state.part, tuple(kept))
-    f = by_lane(lambda flow, t, y, state: flow.model.flow(t, y, state), flow, lane.t, y, state)
+    state = ModeState(lane.modes, lane.parts, tuple(kept))
+    f = by_lane(lambda model, t, y, state: model.flow(t, y, state), flow.model, lane.t, y, state)
     moved, zero = lane.moved, jnp.zeros_like(c.halted)
     return dataclasses.replace(
         c,

@@ -1,7 +1,8 @@
 """Which models the exact flow is made for, and what of them stays the same in all modes."""
 
+import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax as dfx
 import jax
@@ -16,8 +17,9 @@ from ..._numerics._select import select
 from ..._numerics._series import Series
 from ..._types import Scalar, Y
 from ...system._impact import impact
-from ...system._mode import ModeState
+from ...system._mode import ModeState, put, Slot
 from ...system._model import SwitchedSystem
+from ...system._relay import relay
 from ...system._sgn import sgn
 from .._loop import Flow
 from ..steppers._exponential import affine_parts
@@ -31,11 +33,12 @@ MOST_SWITCHES = 18  # whose modes make one 32-bit number
 
 
 class GuardRow(NamedTuple):
-    """Guards of one switch of which only one can fall to zero in a mode: its slots while free and while holding."""
+    """Guards of one switch of which only one can fall to zero in a mode: its slots while free and while holding. Of a
+    surface of several components each has a row of its own."""
 
     switch: int
-    free: int | None
-    held: int | None
+    free: Slot | None
+    held: Slot | None
 
 
 class Plan(NamedTuple):
@@ -45,11 +48,16 @@ class Plan(NamedTuple):
     timed: bool  # whether time enters
     rows: tuple[GuardRow, ...]
     pattern: tuple[tuple[bool, ...], ...]  # which entries of the matrices of all modes may not be zero
+    crossed: dict[int, tuple[int, ...]]  # switches that are only crossed: on which surfaces that can hold they act
 
     @property
     def width(self) -> int:
         """The number of components of z."""
         return self.size + (3 if self.timed else 1)
+
+    def of(self, k: int) -> list[int]:
+        """The rows of a switch."""
+        return [r for r, row in enumerate(self.rows) if row.switch == k]
 
 
 class Constants(NamedTuple):
@@ -61,102 +69,152 @@ class Constants(NamedTuple):
     level: dict[int, Flat]  # of contacts: dh/dt in flight as a row times z
     bound: dict[int, Scalar]  # of λ
     restitution: dict[int, Scalar]
+    pull: dict[int, Columns]  # of each `sgn` switch that is only crossed: the derivative of the field by its value
+    levels: dict[int, Columns]  # of relays: the indicator functions of their two surfaces
     forcing: Columns  # what is left of field and indicator functions at y = 0, as columns for (S, C, 1)
     fits: Bool[Array, ""]  # whether this stands for them
 
 
 class Problem(NamedTuple):
-    """One solve of a model that is allowed."""
+    """One solve of a model that has a plan."""
 
     flow: Flow
+    model: SwitchedSystem  # that of the plan
     plan: Plan
     constants: Constants
     like: Y  # a state
     theta: float  # the phase that an arc may pass through
 
 
-def allows(model: SwitchedSystem, meter: dfx.AbstractProgressMeter, state: ModeState, t: Scalar, y: Y) -> bool:
-    """Whether a model is affine in every mode, with no other switches than `sgn` and `impact` with one h each, none of
-    which acts on the surface of another one. (Of friction beside a wall, or of three coupled surfaces, a third of the
-    events are not plain, and sweeps took up to twice the time of the general flow.)"""
-    if not all(model.apart):
-        return False
+def planned(
+    model: SwitchedSystem, meter: dfx.AbstractProgressMeter, state: ModeState, t: Scalar, y: Y
+) -> tuple[SwitchedSystem, Plan] | None:
+    """The plan of a model that is affine in every mode, and the model as it sees it; None for any other.
+
+    Its switches are of two kinds: those that may hold the solution, `sgn` and `impact` with one h each, none of which
+    acts on the surface of another one (of friction beside a wall, or of three coupled surfaces, a third of the events
+    are not plain, and sweeps took up to twice the time of the general flow); and those that are only crossed: relays,
+    and `sgn` switches whose effect vanishes on their surface, as springs and stops of any number of components.
+    """
     if not isinstance(meter, dfx.NoProgressMeter) or len(model.switches) > MOST_SWITCHES:
-        return False
-    for k, switch in enumerate(model.switches):
-        smooth = model.parts[k] == 1 and not switch.condition
-        newton = isinstance(switch, impact) and switch.restitution_fn is not None and k in model.contacts
-        if not (smooth and (isinstance(switch, sgn) or newton)):
-            return False
+        return None
+    if any(switch.condition or not isinstance(switch, (sgn, impact, relay)) for switch in model.switches):
+        return None
     zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
+    crossed = tuple(k for k in range(len(zeros)) if not _simple(model, k, t, y) and _let_through(model, k, t, y))
+    if crossed:
+        model = SwitchedSystem(model.system, model.direction, t, y, crossed=crossed)
+    for k, switch in enumerate(model.switches):
+        newton = isinstance(switch, impact) and switch.restitution_fn is not None and k in model.contacts
+        if k not in crossed and not (_simple(model, k, t, y) and (isinstance(switch, sgn) or newton)):
+            return None
+    if not (model.steady and model.jointly_affine):
+        return None
+    fields = [lambda t, y: model.field(t, y, zeros), lambda t, y: model.flow(t, y, state)]
+    fields += [ft.partial(pull, model, k, zeros) for k in crossed]
+    if model.slots:
+        fields.append(lambda t, y: model.guards(t, y, state))
+    if not all(all(affine_parts(fn, t, y)) for fn in fields):
+        return None
+    return model, _plan(model, crossed, state, t, y)
 
-    def pushed(at: tuple[Scalar, Y, tuple]) -> Y:
-        t, y, s = at
-        return jax.jvp(lambda s: model.field(t, y, s), (s,), (tuple(jnp.ones_like(x) for x in s),))[1]
 
-    if not (model.steady and model.jointly_affine and is_constant(pushed, (t, y, zeros))):
+def pull(model: SwitchedSystem, k: int, s: tuple, t: Scalar, y: Y) -> Y:
+    """The derivative of the field by the value of switch k."""
+    return jax.jvp(lambda value: model.field(t, y, put(s, (k,), (value,))), (s[k],), (jnp.ones_like(s[k]),))[1]
+
+
+def _simple(model: SwitchedSystem, k: int, t: Scalar, y: Y) -> bool:
+    """Whether a switch may hold the solution: it has one h, and to do with no other, and acts always in one way."""
+    zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
+    steady = is_constant(lambda at: pull(model, k, at[2], at[0], at[1]), (t, y, zeros))
+    return model.parts[k] == 1 and model.apart[k] and steady and not isinstance(model.switches[k], relay)
+
+
+def _let_through(model: SwitchedSystem, k: int, t: Scalar, y: Y) -> bool:
+    """Whether a switch may be one that is only crossed: what it does to its own dh/dt is nothing, or a function of what
+    its h is a function of, as the force of a stop that vanishes where it lets go. (Friction under a load that varies is
+    not. Whether it vanishes is asked at each event.)"""
+    switch, zeros = model.switches[k], tuple(jnp.zeros_like(t) for _ in model.switches)
+    if isinstance(switch, impact) or (switch.static and k in model.holdable):
         return False
-    if not all(affine_parts(lambda t, y: model.field(t, y, zeros), t, y)):
+    if not is_constant(lambda s: pull(model, k, s, t, y), zeros):
         return False
-    if not all(affine_parts(lambda t, y: model.flow(t, y, state), t, y)):
-        return False
-    return not model.slots or all(affine_parts(lambda t, y: model.guards(t, y, state), t, y))
+    if isinstance(switch, relay):
+        return True
+    x, unravel = jfu.ravel_pytree(y)
+
+    def h(t: Scalar, x: Flat) -> list[Scalar]:
+        return list(model.h(k, t, unravel(x)))
+
+    def gains(x: Flat, s: tuple) -> list[Scalar]:
+        return jax.jvp(lambda x: h(t, x), (x,), (_flat(pull(model, k, s, t, unravel(x))),))[1]
+
+    acts = dependence(lambda s: jax.jvp(h, (t, x), (jnp.ones_like(t), _flat(model.field(t, y, s))))[1], zeros)[:, k]
+    own, seen = dependence(lambda x: h(t, x), x), dependence(lambda x: gains(x, zeros), x)
+    return all(not a or (g.any() and not (g & ~o).any()) for a, o, g in zip(acts, own, seen))
 
 
-def made(flow: Flow, state: ModeState, t: Scalar, y: Y) -> Plan:
-    """The plan of a model that is allowed."""
-    model, x = flow.model, jfu.ravel_pytree(y)[0]
+def surfaces(model: SwitchedSystem, k: int, t: Scalar, y: Y) -> tuple[Scalar, ...]:
+    """All indicator functions of a switch."""
+    return model.switches[k].surfaces(model.system, model.time(t), y)
+
+
+def _flat(y: Y) -> Flat:
+    return jfu.ravel_pytree(y)[0]
+
+
+def _plan(model: SwitchedSystem, crossed: tuple[int, ...], state: ModeState, t: Scalar, y: Y) -> Plan:
+    x, unravel = jfu.ravel_pytree(y)
     rows = []
     for k in range(len(model.switches)):
-        own = [i for i, slot in enumerate(model.slots) if slot.switch == k]
-        free = next(i for i in own if not model.slots[i].holding)
-        held = [i for i in own if model.slots[i].holding]
-        rows.append(GuardRow(k, free, held[0] if held else None))
-        rows += [GuardRow(k, None, i) for i in held[1:]]
-    zeros = jnp.zeros_like(x)
-    timed = not is_constant(lambda t: raw(model, t, y), t)
-    timed = timed or not is_constant(lambda t: of_mode(flow, rows, y, state)(t, zeros), t)
-    plan = Plan(len(x), timed, tuple(rows), ())
-    return plan._replace(pattern=_pattern(flow, plan, state, t, y))
-
-
-def _pattern(flow: Flow, plan: Plan, state: ModeState, t: Scalar, y: Y) -> tuple[tuple[bool, ...], ...]:
-    model, x = flow.model, jfu.ravel_pytree(y)[0]
-    unravel = jfu.ravel_pytree(y)[1]
+        free = [slot for slot in model.slots if slot.switch == k and not slot.holding]
+        held = [slot for slot in model.slots if slot.switch == k and slot.holding]
+        rows.append(GuardRow(k, free[0], held[0] if held else None))
+        rows += [GuardRow(k, slot, None) for slot in free[1:]] + [GuardRow(k, None, slot) for slot in held[1:]]
+    zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
+    reach = dependence(lambda s: model.rates(model.holdable, t, y, state, s), zeros) if model.holdable else []
+    acts = {k: tuple(j for j, row in zip(model.holdable, reach) if row[k]) for k in crossed}
+    plan = Plan(len(x), False, tuple(rows), (), acts)
+    timed = not is_constant(lambda t: raw(model, plan, t, y), t)
+    timed = timed or not is_constant(lambda t: of_mode(model, plan, y, state)(t, jnp.zeros_like(x)), t)
 
     def entries(x: Flat) -> list[Scalar]:
-        out = jfu.ravel_pytree(model.flow(t, unravel(x), state))[0]
+        out = _flat(model.flow(t, unravel(x), state))
         return [out[i] for i in range(plan.size)]
 
-    own = dependence(entries, x)
-    return tuple((*map(bool, row), *[True] * (plan.width - plan.size)) for row in own)
+    plan, own = plan._replace(timed=timed), dependence(entries, x)
+    pattern = tuple((*map(bool, row), *[True] * (plan.width - plan.size)) for row in own)
+    return plan._replace(pattern=pattern)
 
 
-def raw(model: SwitchedSystem, t: Scalar, y: Y) -> Flat:
-    """Field and indicator functions at y = 0, as functions of time."""
+def raw(model: SwitchedSystem, plan: Plan, t: Scalar, y: Y) -> Flat:
+    """Field and indicator functions at y = 0, and what each switch that is only crossed adds, as functions of time."""
     still = jax.tree.map(jnp.zeros_like, y)
     zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
-    h = [model.h(k, t, still)[0][None] for k in range(len(model.switches))]
-    return jnp.concatenate([jfu.ravel_pytree(model.field(t, still, zeros))[0], *h])
+    h = [x[None] for k in range(len(model.switches)) for x in surfaces(model, k, t, still)]
+    pulls = [_flat(pull(model, k, zeros, t, still)) for k in plan.crossed]
+    return jnp.concatenate([_flat(model.field(t, still, zeros)), *h, *pulls])
 
 
-def of_mode(flow: Flow, rows: Any, y: Y, state: ModeState) -> Callable[[Scalar, Flat], Flat]:
+def of_mode(model: SwitchedSystem, plan: Plan, y: Y, state: ModeState) -> Callable[[Scalar, Flat], Flat]:
     """The field of a mode, its guards, and what removes the drift off the surfaces that hold, one below the other."""
-    model, unravel = flow.model, jfu.ravel_pytree(y)[1]
+    unravel = jfu.ravel_pytree(y)[1]
 
     def fn(t: Scalar, x: Flat) -> Flat:
         y = unravel(x)
-        guards = model.guards(t, y, state) if model.slots else []
+        guards = dict(zip(model.slots, model.guards(t, y, state))) if model.slots else {}
         values = []
-        for row in rows:
-            free, held = ([] if i is None else guards[i] for i in (row.free, row.held))
-            if free and held:
-                values.append(select(model.held(row.switch, state.mode[row.switch]), held[0], free[0]))
+        for k, free, held in plan.rows:
+            if free is not None and k in plan.crossed and isinstance(model.switches[k], sgn):
+                values.append(state.mode[k].astype(t.dtype) * model.h(k, t, y)[free.part])
+            elif free and held:
+                values.append(select(model.held(k, state.mode[k]), guards[held][0], guards[free][0]))
             else:
-                values.append((free or held)[0])
-        parts = [jfu.ravel_pytree(model.flow(t, y, state))[0], *[v[None] for v in values]]
+                values.append(guards[free or held][0])
+        parts = [_flat(model.flow(t, y, state)), *[v[None] for v in values]]
         if model.holdable:
-            parts.append(jfu.ravel_pytree(model.project(t, y, state))[0])
+            parts.append(_flat(model.project(t, y, state)))
         return jnp.concatenate(parts)
 
     return fn
@@ -176,18 +234,14 @@ def columns(fn: Callable[[Scalar, Flat], Flat], plan: Plan, t: Scalar) -> Column
     return jnp.concatenate([*parts, fn(t, zeros)[:, None]], axis=1)
 
 
-def constants(flow: Flow, plan: Plan, y: Y) -> Constants:
+def constants(model: SwitchedSystem, plan: Plan, t: Scalar, y: Y) -> Constants:
     """For one lane."""
-    model, t, (x, unravel) = flow.model, flow.t0, jfu.ravel_pytree(y)
+    x, unravel = jfu.ravel_pytree(y)
     zeros, still = tuple(jnp.zeros_like(t) for _ in model.switches), jnp.zeros_like(x)
-
-    def field(s: tuple) -> Flat:
-        return jfu.ravel_pytree(model.field(t, unravel(still), s))[0]
 
     push, gain, level, bound, restitution = {}, {}, {}, {}, {}
     for k in model.holdable:
-        unit = tuple(select(i == k, 1, 0).astype(t.dtype) for i in range(len(zeros)))
-        push[k] = jax.jvp(field, (zeros,), (unit,))[1]
+        push[k] = _flat(pull(model, k, zeros, t, unravel(still)))
         if k in model.contacts:
             free = ModeState.of([jnp.zeros((), jnp.int32)] * len(zeros), [None] * len(zeros))
 
@@ -200,17 +254,23 @@ def constants(flow: Flow, plan: Plan, y: Y) -> Constants:
         else:
             gain[k] = jax.jvp(lambda x, k=k: model.h(k, t, unravel(x))[0], (still,), (push[k],))[1]
             bound[k] = jnp.asarray(model.bound(k), t.dtype)
+    pulls, levels = {}, {}
+    for k in plan.crossed:
+        if isinstance(model.switches[k], relay):
+            levels[k] = columns(lambda t, x, k=k: jnp.stack(surfaces(model, k, t, unravel(x))), plan, t)
+        else:
+            pulls[k] = columns(lambda t, x, k=k: _flat(pull(model, k, zeros, t, unravel(x))), plan, t)
     frequency, forcing, fits = _forcing(model, plan, t, y)
-    return Constants(frequency, push, gain, level, bound, restitution, forcing, fits)
+    return Constants(frequency, push, gain, level, bound, restitution, pulls, levels, forcing, fits)
 
 
 def _forcing(model: SwitchedSystem, plan: Plan, t: Scalar, y: Y) -> tuple[Scalar, Columns, Bool[Array, ""]]:
     """What depends on time, with b''' = -ω² b': constant, linear, quadratic or harmonic. (Forcing that grows or decays
     exponentially is left to the general flow: its S and C grow, and cancel.)"""
-    now = raw(model, t, y)
+    now = raw(model, plan, t, y)
     if not plan.timed:
         return jnp.zeros_like(t), now[:, None], jnp.ones((), bool)
-    series = Series(lambda t: [raw(model, t, y)], t)
+    series = Series(lambda t: [raw(model, plan, t, y)], t)
     terms = [series.step(k, t if k == 0 else jnp.ones_like(t) if k == 1 else None)[0] for k in range(5)]
     b1, b2, b3, b4 = (jnp.zeros_like(now) if c is None else w * c for w, c in zip((1.0, 2.0, 6.0, 24.0), terms[1:]))
     size = b1 @ b1 + b2 @ b2
@@ -231,6 +291,6 @@ def numbers(model: SwitchedSystem) -> int:
     """How many modes there are."""
     count = 1
     for k, switch in enumerate(model.switches):
-        free = 2 if isinstance(switch, sgn) else 1
+        free = 1 if isinstance(switch, impact) else 2
         count *= free + (k in model.holdable)
     return count

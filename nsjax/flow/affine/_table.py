@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from ..._numerics._autodiff import frozen
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
-from .._loop import Flow
+from ...system._model import SwitchedSystem
 from ._plan import columns, of_mode, Plan, Problem
 
 
@@ -79,11 +79,11 @@ def by_lane(fn: Callable[..., Any], *args: Any) -> Any:
     return eqx.combine(found, rest[-1])
 
 
-def maps(flow: Flow, plan: Plan, y: Y, state: ModeState) -> tuple[Array, Array, Array | None]:
+def maps(model: SwitchedSystem, plan: Plan, t: Scalar, y: Y, state: ModeState) -> tuple[Array, Array, Array | None]:
     """Matrix, guards and projection of a mode, for one lane."""
-    found = columns(of_mode(flow, plan.rows, y, state), plan, flow.t0)
+    found = columns(of_mode(model, plan, y, state), plan, t)
     n, count = plan.size, len(plan.rows)
-    return found[:n], found[n : n + count], found[n + count :] if flow.model.holdable else None
+    return found[:n], found[n : n + count], found[n + count :] if model.holdable else None
 
 
 def spectral_size(matrix: Float[Array, "n n lanes"]) -> Lanes:
@@ -111,8 +111,10 @@ def whole(plan: Plan, matrix: Float[Array, "n m lanes"], squared: Lanes) -> Floa
 
 def tabulate(problem: Problem, state: ModeState, key: Lanes) -> Table:
     """The tables of the modes of all lanes."""
-    flow, plan, constants, y, theta = problem
-    matrix, guards, projection = by_lane(lambda flow, y, state: maps(flow, plan, y, state), flow, y, state)
+    flow, model, plan, constants, y, theta = problem
+    matrix, guards, projection = by_lane(
+        lambda model, t, y, state: maps(model, plan, t, y, state), model, flow.t0, y, state
+    )
     squared = frozen(constants.frequency)
     size = spectral_size(frozen(matrix)[:, : plan.size])
     if plan.timed:

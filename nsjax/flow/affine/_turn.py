@@ -16,7 +16,7 @@ from .._save import Log, Saved
 from ..steppers._exponential import _N
 from ..steppers._stepper import stack
 from ._arc import arrived, dot, full, matrix_rows, Rows, series, TERMS
-from ._isolate import isolate, root
+from ._isolate import Corner, isolate, root
 from ._lane import found_in, Lane, logged, state_of
 from ._plain import magnitude, Meeting, Plain, plain, small
 from ._plan import Plan, Problem, raw
@@ -68,12 +68,16 @@ def look(plan: Plan, table: Table, lane: Lane, flow: Flow, live: Truths) -> Arc:
         a = once(sum(picked(table.polynomials[..., q, :], lane.index) * x for q, x in enumerate(z)))
         missed = once(sum(picked(table.missed[..., q, :], lane.index) * jnp.abs(x) for q, x in enumerate(z)))
         known = jnp.stack(lane.known)
-        found = isolate(a, known, missed, live)
+        corners = [Corner(plan.of(k), lane.modes[k] < 0) for k in plan.crossed if len(plan.of(k)) > 1]
+        found = isolate(a, known, missed, live, corners)
         fires = found.fires & live
-        event = jnp.any(fires, axis=0)
-        chosen = once(jnp.sum(select(fires[:, None], found.coefficients, 0), axis=0))
-        at = root(chosen, jnp.sum(select(fires, known, 0), axis=0), event)
-        share, doubtful = found.share, found.doubtful
+        event, share, doubtful = jnp.any(fires, axis=0), found.share, found.doubtful
+        if corners:
+            at, fires, tip = last(fires, found.coefficients, known, corners)
+            doubtful = doubtful | tip
+        else:
+            chosen = once(jnp.sum(select(fires[:, None], found.coefficients, 0), axis=0))
+            at = root(chosen, jnp.sum(select(fires, known, 0), axis=0), event)
     left, ahead = frozen(span), share * length
     tau = at * ahead
     slack = LATE * left + 2 * float(jnp.finfo(left.dtype).eps) * jnp.abs(flow.t1)
@@ -82,6 +86,24 @@ def look(plan: Plan, table: Table, lane: Lane, flow: Flow, live: Truths) -> Arc:
     final = ~event & (ahead >= left) & live
     tau = select(final, span, frozen(select(live, select(event, tau, ahead), 0)))
     return Arc(once(tau), event, fires & event, final, doubtful, length)
+
+
+def last(
+    fires: Bool[Array, "rows lanes"], a: Float[Array, "rows coefficients lanes"], known: Array, corners: list[Corner]
+) -> tuple[Lanes, Bool[Array, "rows lanes"], Truths]:
+    """Of the guards that fall, as those of a corner may together, where the last one does, and which; and whether
+    another one does so at the same place."""
+    place = np.zeros(len(a), int)  # each of a corner has its own
+    for rows, _ in corners:
+        place[rows] = range(len(rows))
+    groups = [np.flatnonzero(place == p) for p in range(place.max() + 1)]
+    chosen = once(jnp.stack([jnp.sum(select(fires[g, None], a[g], 0), axis=0) for g in groups], axis=1))
+    some = jnp.stack([jnp.any(fires[g], axis=0) for g in groups])
+    roots = root(chosen, jnp.stack([jnp.sum(select(fires[g], known[g], 0), axis=0) for g in groups]), some)
+    roots = select(some, roots, -1)
+    at = ft.reduce(jnp.maximum, roots)
+    late = some & (roots > at - SOON)
+    return at, fires & (roots == at)[place], jnp.sum(late.astype(jnp.int32), axis=0) > 1
 
 
 def go(plan: Plan, rows: list[Rows], guards: list[Rows], projection: Any, z: Rows, arc: Arc, theta: float) -> There:
@@ -117,7 +139,7 @@ def go(plan: Plan, rows: list[Rows], guards: list[Rows], projection: Any, z: Row
 
 def turn(problem: Problem, table: Table, lane: Lane) -> Lane:
     """All lanes one arc on; those for which that is not plain are marked as slow and stay where they are."""
-    flow, plan, constants, like, theta = problem
+    flow, model, plan, constants, like, theta = problem
     live = lane.active & (lane.index >= 0) & ~lane.slow
     arc = look(plan, table, lane, flow, live)
     n, m = plan.size, plan.width
@@ -133,16 +155,16 @@ def turn(problem: Problem, table: Table, lane: Lane) -> Lane:
     if plan.timed:
         sure = sure & _as_predicted(problem, t, there.z)
     none = jnp.zeros_like(lane.steps)
-    after = Plain(sure, there.z[:n], lane.modes, [none] * len(plan.rows), none, ~live)
+    after = Plain(sure, there.z[:n], lane.modes, lane.parts, [none] * len(plan.rows), none, ~live)
     if plan.rows:
-        met = Meeting(frozen(t), there.z, rows, [*arc.fires], there.rate, guards, lane.modes)
-        after = plain(flow, plan, constants, met)
+        met = Meeting(frozen(t), there.z, rows, [*arc.fires], there.rate, guards, lane.modes, lane.parts)
+        after = plain(problem, met)
         sure = sure & (~arc.event | (after.sure & (frozen(t) < flow.t1)))
     # Of a stiff mode an arc is as short as what decays fast is, whether that is still there or not.
     sure = sure & ~(many(flow, arc.length) & (lane.wait > 3 * arc.length))
     # The general flow has the last word on limits.
     sure = sure & (lane.steps + 1 < flow.max_steps)
-    if flow.model.slots:
+    if model.slots:
         sure = sure & (lane.events + 1 < flow.max_events)
     sure = sure & (sum(0 * frozen(v) for v in [*after.x, t]) == 0)
     moved, event = live & sure, live & sure & arc.event
@@ -173,8 +195,8 @@ class End(NamedTuple):
 
 def _as_predicted(problem: Problem, t: Lanes, z: Rows) -> Truths:
     """Whether forcing is what its kind makes of it, which fails after a kink."""
-    flow, plan, constants, like, _ = problem
-    now = by_lane(lambda flow, t, y: raw(flow.model, t, y), *frozen((flow, t, like)))
+    _, model, plan, constants, like, _ = problem
+    now = by_lane(lambda model, t, y: raw(model, plan, t, y), *frozen((model, t, like)))
     columns, clock = frozen((constants.forcing, z[plan.size :]))
     terms = [columns[:, q] * x for q, x in enumerate(clock)]
     size = sum(map(jnp.abs, terms[1:]), jnp.abs(terms[0]))
@@ -195,6 +217,7 @@ def _moved(plan: Plan, table: Table, lane: Lane, end: End) -> Lane:
         x=choose(moved, after.x, lane.x),
         clock=choose(moved, there.z[plan.size : -1], lane.clock),
         modes=modes,
+        parts=tuple(old if old is None else select(event, new, old) for new, old in zip(after.parts, lane.parts)),
         known=[select(event, a, select(moved, none, b)) for a, b in zip(after.known, lane.known)],
         index=select(event, found_in(table, modes, none), lane.index),
         wait=select(moved, 1.26 * lane.wait, lane.wait),
@@ -208,7 +231,7 @@ def _moved(plan: Plan, table: Table, lane: Lane, end: End) -> Lane:
 
 def _written(problem: Problem, lane: Lane, end: End) -> Log:
     """The log with the events of this turn."""
-    flow, plan, _, like, _ = problem
+    flow, _, plan, _, like, _ = problem
     before, after = (state_of(x, like) for x in (end.there.z[: plan.size], end.after.x))
     row = (
         end.t * flow.model.direction,
@@ -229,7 +252,7 @@ def saves(flow: Flow) -> bool:
 
 def _saved(problem: Problem, lane: Lane, arc: Arc, end: End, new: Lane) -> Saved:
     """What `saveat` asks for of this turn."""
-    flow, plan, _, like, _ = problem
+    flow, _, plan, _, like, _ = problem
     t, there, after, moved, event = end
     points = _points(plan, arc, there, like) if flow.want_points else None
     if flow.record is not None:

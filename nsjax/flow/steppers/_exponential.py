@@ -94,14 +94,15 @@ class Exponential(AbstractExponential):
 
 
 class Affine(AbstractExponential):
-    """`Exponential`, and for models whose switches are `sgn` and `impact` the flow from event to event in one step.
+    """`Exponential`, and for models with `sgn` switches, impacts and relays the flow from event to event in one step.
 
     The guards on an arc are polynomials, made once for each mode that a lane comes to, which only find the event; its
     time and the state are those of the exact flow. Events at which there is nothing to choose are worked out for all
     lanes of a batch at once. Whatever is not plainly so (events at one instant, accumulating impacts, contacts that
-    lift off, tangencies, ends on a surface) is left to the general loop; so are models with relays, clocks, surfaces
-    of several components or resets of their own, or in which one switch acts on the surface of another one (friction
-    and a wall on one body), for which this is `Exponential`. Tolerances play no role.
+    lift off, tangencies, ends on a surface) is left to the general loop. So are models with clocks or resets of their
+    own, or in which one switch that can hold the solution acts on the surface of another one (friction and a wall on
+    one body), for which this is `Exponential`. Stops and springs, of any number of components, are taken for switches
+    that are only crossed: where one holds after all, the general loop has it. Tolerances play no role.
 
     Within `nsjax.sweep` it is the default. There what is plain is a program of its own, that is compiled sooner
     than others; lanes that it leaves over are computed again with the general loop, by a second program, which is
