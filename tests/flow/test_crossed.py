@@ -11,8 +11,7 @@ from nsjax import gallery, RESULTS, solve, Taylor
 from nsjax._numerics._bernstein import binomials
 from nsjax._numerics._first_pass import first_pass, told
 from nsjax._numerics._select import select
-from nsjax.flow.affine._isolate import Corner, isolate
-from nsjax.flow.affine._turn import last
+from nsjax.flow.affine._isolate import Corner, isolate, last
 
 
 # The search for the last of the guards that belong together.
@@ -31,7 +30,7 @@ def first_event(a, joint):
     corners = [Corner([0, 1, 2], joint[0]), Corner([3, 4], joint[1])]
     nought = jnp.zeros(a.shape[:1] + a.shape[2:])
     found = isolate(a, nought.astype(jnp.int32), nought, jnp.ones(a.shape[-1], bool), corners)
-    at, fires, tip = last(found.fires, found.coefficients, nought.astype(jnp.int32), corners)
+    at, fires, tip = last(found, found.fires, nought.astype(jnp.int32), corners)
     return found.share, found.doubtful | tip, jnp.any(found.fires, 0), at, fires
 
 

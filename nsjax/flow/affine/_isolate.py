@@ -1,7 +1,7 @@
 """Where on an arc the first event is, by sign variations of the polynomials of the guards, for all lanes at once."""
 
 import functools as ft
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.lax as lax
 import jax.numpy as jnp
@@ -14,7 +14,8 @@ from ..._numerics._select import select
 
 
 DEPTH = 24  # halvings of an arc; what they do not separate is left to the general flow
-NEAR = 1e-4  # how near to zero a guard may come without an event, as a part of its size on the arc
+NEAR = 1e-5  # how near to zero a guard may come without an event, as a part of its size on the arc
+SOON = 1e-7  # how near to each other two roots may be, or one to the start, as a part of the arc
 _HALLEY = 2
 
 Lanes = Float[Array, " lanes"]
@@ -43,7 +44,7 @@ class _Look(NamedTuple):
     variations: Int[Array, "rows lanes"]
     begun: Truths  # whether some guard is not positive at the start
     near: Truths  # whether some guard without a root comes near to zero
-    late: Truths  # the same, but not at the start: it may be a root beyond the end, or only coefficients
+    late: Truths  # or only seems to, by its coefficients, or at the end: a root may be right behind that
     many: Truths  # whether more roots than one may be left
 
 
@@ -58,7 +59,7 @@ def _look(a: Array, known: Int[Array, "rows lanes"], size: Array, corners: list[
     weights = binomials(count - 1)
     least = ft.reduce(jnp.minimum, [x / w for x, w in zip(kept, weights)])
     largest = ft.reduce(jnp.maximum, [jnp.abs(x) / w for x, w in zip(kept, weights)])
-    room = NEAR * select(known > 0, largest, size)
+    room = max(NEAR, 1e3 * float(jnp.finfo(a.dtype).eps)) * select(known > 0, largest, size)
     close, begun, free = (variations == 0) & ~(least > room), ~signs[0], kept[0] > 2 * room
     rows = _Look(variations, begun, close & ~free, close & free, variations > 1)
     event = variations > 0
@@ -97,13 +98,12 @@ def _joined(rows: _Look, below: Array, free: Array, corners: list[Corner]) -> tu
 
 
 def _halved(a: Array) -> Array:
-    """The first half."""
-    weights = binomials(a.shape[1] - 1)
-    b, out = [a[:, j] / w for j, w in enumerate(weights)], []
-    for w in weights:
-        out.append(b[0] * w)
-        b = [0.5 * (x + y) for x, y in zip(b, b[1:])]
-    return jnp.stack(out, axis=1)
+    """The first half. (Each coefficient from those of the whole: by halves of halves XLA would compute these anew.)"""
+    n = a.shape[1] - 1
+    b = [a[:, j] / w for j, w in enumerate(binomials(n))]
+    rows = [[w * 0.5**k for w in binomials(k)] for k in range(n + 1)]
+    sums = (sum(w * x for w, x in zip(row[1:], b[1:])) + row[0] * b[0] for row in rows)
+    return jnp.stack([w * x for w, x in zip(binomials(n), sums)], axis=1)
 
 
 def isolate(
@@ -115,25 +115,49 @@ def isolate(
 ) -> Isolated:
     """**Arguments:** the scaled Bernstein coefficients of the guards on the arc; how many roots each has at its start;
     what the polynomials may be off; which lanes have work; which guards belong together."""
-    weights = jnp.asarray(np.array(binomials(a.shape[1] - 1))[:, None], a.dtype)
-    size = jnp.max(jnp.abs(a) / weights, axis=1)
+    size = once(ft.reduce(jnp.maximum, [jnp.abs(a[:, j]) / w for j, w in enumerate(binomials(a.shape[1] - 1))]))
     rough = jnp.any(~(missed <= 1e-6 * size), axis=0)  # a guard that is NaN too
-    seen = _look(a, known, size, corners)
-    share = jnp.ones_like(a[0, 0])
+    look = ft.partial(_look, known=known, size=size, corners=corners)
 
     def busy(carry: tuple) -> Array:
-        depth, _, _, seen = carry
+        depth, *_, seen = carry
         return jnp.any((seen.many | seen.late) & ~seen.begun & wanted & ~rough) & (depth < DEPTH)
 
     def halve(carry: tuple) -> tuple:
         depth, a, share, seen = carry
         again = (seen.many | seen.late) & wanted
         a, share = select(again, _halved(a), a), select(again, 0.5 * share, share)
-        return depth + 1, a, share, _look(a, known, size, corners)
+        return depth + 1, a, share, look(a)
 
-    _, a, share, seen = lax.while_loop(busy, halve, (jnp.zeros((), jnp.int32), a, share, seen))
+    start = (jnp.zeros((), jnp.int32), a, jnp.ones_like(a[0, 0]), look(a))
+    _, a, share, seen = lax.while_loop(busy, halve, start)
     doubtful = seen.many | seen.late | seen.begun | seen.near | rough
     return Isolated(share, a, seen.variations > 0, doubtful)
+
+
+def last(
+    found: Isolated, fires: Bool[Array, "rows lanes"], known: Int[Array, "rows lanes"], corners: list[Corner]
+) -> tuple[Lanes, Bool[Array, "rows lanes"], Truths]:
+    """Where the guard that `fires` falls, as a part of the arc; of those of a corner, which may be several, the last
+    one. And which it is, and whether another one falls at the same place."""
+
+    def chosen(x: Any, rows: Any) -> Array:
+        return sum((select(fires[r], x[r], 0) for r in rows[1:]), select(fires[rows[0]], x[rows[0]], 0))
+
+    a, every = found.coefficients, range(len(fires))
+    if not corners:
+        at = root(once(chosen(a, every)), chosen(known, every), jnp.any(fires, axis=0))
+        return at, fires, jnp.zeros_like(found.doubtful)
+    place = np.zeros(len(a), int)  # each of a corner has its own
+    for rows, _ in corners:
+        place[rows] = range(len(rows))
+    groups = [np.flatnonzero(place == p) for p in range(place.max() + 1)]
+    some = jnp.stack([ft.reduce(jnp.logical_or, [fires[r] for r in rows]) for rows in groups])
+    stacked = once(jnp.stack([chosen(a, rows) for rows in groups], axis=1))
+    roots = select(some, root(stacked, jnp.stack([chosen(known, rows) for rows in groups]), some), -1)
+    at = ft.reduce(jnp.maximum, roots)
+    late = [(x & (r > at - SOON)).astype(jnp.int32) for x, r in zip(some, roots)]
+    return at, fires & (roots == at)[place], jnp.sum(jnp.stack(late), axis=0) > 1
 
 
 def _horner(c: list[Array], x: Array) -> tuple[Array, Array, Array]:

@@ -199,12 +199,13 @@ def logged(log: Log, index: Numbers, when: Truths, row: tuple[Any, ...]) -> Log:
     """`Log.write` for all lanes."""
 
     def put(buffer: Array, value: Array) -> Array:
-        place = select(when, index, buffer.shape[0])
-        if buffer.ndim == 2:
-            return _put(buffer, place, value)
         values = value.reshape(-1, value.shape[-1])
-        flat = buffer.reshape(buffer.shape[0], *values.shape)
-        return jnp.stack([_put(flat[:, j], place, x) for j, x in enumerate(values)], axis=1).reshape(buffer.shape)
+        rows = buffer.reshape(
+            -1, buffer.shape[-1]
+        )  # (each number of a state or mode by itself: to stack them copies all)
+        for j, x in enumerate(values):
+            rows = _put(rows, select(when, index * len(values) + j, len(rows)), x)
+        return rows.reshape(buffer.shape)
 
     def columns(log: Log) -> tuple:
         return log.t, log.before, log.after, log.slot, log.modes, log.transversality

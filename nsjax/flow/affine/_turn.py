@@ -16,7 +16,7 @@ from .._save import Log, Saved
 from ..steppers._exponential import _N
 from ..steppers._stepper import stack
 from ._arc import arrived, dot, full, matrix_rows, Rows, series, TERMS
-from ._isolate import Corner, isolate, root
+from ._isolate import Corner, isolate, last, SOON
 from ._lane import found_in, Lane, logged, state_of
 from ._plain import magnitude, Meeting, Plain, plain, small
 from ._plan import Plan, Problem, raw
@@ -26,7 +26,6 @@ from ._table import by_lane, economised, Table
 Lanes = Float[Array, " lanes"]
 Truths = Bool[Array, " lanes"]
 LATE = 1e-8  # how near to the end an event, as a part of what is left, is looked at by the general flow
-SOON = 1e-7  # the same for the beginning of an arc
 MOST_ARCS = 1024  # of a mode; for one that would take more the general flow is asked how long its steps are
 
 
@@ -72,12 +71,8 @@ def look(plan: Plan, table: Table, lane: Lane, flow: Flow, live: Truths) -> Arc:
         found = isolate(a, known, missed, live, corners)
         fires = found.fires & live
         event, share, doubtful = jnp.any(fires, axis=0), found.share, found.doubtful
-        if corners:
-            at, fires, tip = last(fires, found.coefficients, known, corners)
-            doubtful = doubtful | tip
-        else:
-            chosen = once(jnp.sum(select(fires[:, None], found.coefficients, 0), axis=0))
-            at = root(chosen, jnp.sum(select(fires, known, 0), axis=0), event)
+        at, fires, tip = last(found, fires, known, corners)
+        doubtful = doubtful | tip
     left, ahead = frozen(span), share * length
     tau = at * ahead
     slack = LATE * left + 2 * float(jnp.finfo(left.dtype).eps) * jnp.abs(flow.t1)
@@ -86,24 +81,6 @@ def look(plan: Plan, table: Table, lane: Lane, flow: Flow, live: Truths) -> Arc:
     final = ~event & (ahead >= left) & live
     tau = select(final, span, frozen(select(live, select(event, tau, ahead), 0)))
     return Arc(once(tau), event, fires & event, final, doubtful, length)
-
-
-def last(
-    fires: Bool[Array, "rows lanes"], a: Float[Array, "rows coefficients lanes"], known: Array, corners: list[Corner]
-) -> tuple[Lanes, Bool[Array, "rows lanes"], Truths]:
-    """Of the guards that fall, as those of a corner may together, where the last one does, and which; and whether
-    another one does so at the same place."""
-    place = np.zeros(len(a), int)  # each of a corner has its own
-    for rows, _ in corners:
-        place[rows] = range(len(rows))
-    groups = [np.flatnonzero(place == p) for p in range(place.max() + 1)]
-    chosen = once(jnp.stack([jnp.sum(select(fires[g, None], a[g], 0), axis=0) for g in groups], axis=1))
-    some = jnp.stack([jnp.any(fires[g], axis=0) for g in groups])
-    roots = root(chosen, jnp.stack([jnp.sum(select(fires[g], known[g], 0), axis=0) for g in groups]), some)
-    roots = select(some, roots, -1)
-    at = ft.reduce(jnp.maximum, roots)
-    late = some & (roots > at - SOON)
-    return at, fires & (roots == at)[place], jnp.sum(late.astype(jnp.int32), axis=0) > 1
 
 
 def go(plan: Plan, rows: list[Rows], guards: list[Rows], projection: Any, z: Rows, arc: Arc, theta: float) -> There:
