@@ -12,6 +12,7 @@ import pytest
 FOLDER = pathlib.Path(__file__).parents[2] / "benchmarks"
 SMALL = {
     "sweep.py": "--workload S1 --lanes 8 --scipy-lanes 1 --rounds 1",
+    "stops.py": "--lanes 16 --rounds 1",
     "cost.py": "--lanes 4 --repeats 1",
     "first_answer.py": "--repeats 1 --rows",
     "growth.py": "--panels events --repeats 1",
