@@ -72,7 +72,7 @@ def by_scipy(omega: float, c: float = 0.05, x_c: float = 1.0, k_f: float = 4.0, 
             return [y[1], 0.2 * np.sin(omega * t) - c * y[1] - y[0] - force(mode, y)]
 
         accuracy = dict(rtol=1e-13, atol=1e-13, max_step=0.02)  # so short that no contact is missed
-        sol = solve_ivp(rhs, (t, T1), y, "DOP853", events=events, **accuracy)
+        sol: Any = solve_ivp(rhs, (t, T1), y, "DOP853", events=events, **accuracy)
         t, y = sol.t[-1], sol.y[:, -1]
         if sol.status == 1:
             mode = 0 if mode else (1 if len(sol.t_events[0]) else -1)
