@@ -2,7 +2,7 @@
 
     python benchmarks/stops.py --out benchmarks/stops.json
 
-4096 lanes, ω = 0.6 ... 1.5, from x = -0.9, v = 0.94 to t = 100, 2 to 60 events a lane. The stops have surfaces of two
+4096 lanes, ω = 0.6 ... 1.5, from x = -0.9, v = 0.94 to t = 100, 2 to 79 events a lane. The stops have surfaces of two
 components: contact is where a mass is in reach and the force presses. Prints a table in Markdown: medians of the
 rounds, in each of which every method runs once; ratios to Dopri8 within a round; compile time apart. The error is that
 of the final state against scipy's DOP853 with events, at a tolerance of 1e-13, on sixteen of the lanes.

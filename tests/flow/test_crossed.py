@@ -57,7 +57,7 @@ def test_first_event_of_corners():
             ), i
             (row,) = np.flatnonzero(fires[:, i])
             there = values(np.moveaxis(a[:, :, i], 0, 1), share[i] * at[i : i + 1])[0]
-            assert abs(there[row]) < 1e-3 * np.abs(g[:, row]).max()
+            assert abs(there[row]) < 1e-7 * np.abs(g[:, row]).max()
 
 
 # Against closed forms, and against the general flow.
@@ -234,11 +234,11 @@ def test_derivatives_of_a_stop():
     def end(w):
         return solve(gallery.Trilinear(omega=w), 0.0, 30.0, Motion(-0.9, 0.94), throw=False).y1.x
 
-    w, h = jnp.linspace(1.0, 1.3, 8), 1e-5
+    w, h = jnp.linspace(1.0, 1.3, 8), 1e-6
     slope, left = plain(jax.jacfwd(end), w)
     (high, _), (low, _) = plain(end, w + h), plain(end, w - h)
     assert not np.any(left)
-    np.testing.assert_allclose(slope, (high - low) / (2 * h), atol=1e-6 * np.abs(slope).max())
+    np.testing.assert_allclose(slope, (high - low) / (2 * h), atol=1e-8 * np.abs(slope).max())
 
 
 # What is left to the general flow.
@@ -262,15 +262,12 @@ def test_what_may_hold_is_not_swept_so():
 
 
 def test_one_that_holds_after_all_is_left_over():
-    """A stop whose force does not vanish where it lets go, as it is pulled: there both fields point to the surface."""
+    """By its structure this force might vanish with v, as that of a stop; it does not, and the first lane sticks. (The
+    second one is not there yet.)"""
 
-    class Sticky(Bilinear):
+    class Sticky(Loaded):
         def vector_field(self, t, y, s):
-            return Motion(1.0 + 0 * y.x, y.x - 2.0 * y.v - (2.0 + y.v) * s.side)
-
-        @nsjax.sgn
-        def side(self, t, y):
-            return y.v + 0.0 * y.x
+            return Motion(jnp.ones_like(y.x), y.x - 2.0 * y.v - (2.0 + y.v) * s.side)
 
     v, left = plain(lambda v: solve(Sticky(), 0.0, 1.0, Motion(0.0, v)).y1.v, jnp.array([0.5, 9.0]))
     assert np.array_equal(left, [True, False]) and np.isfinite(v[1])

@@ -90,7 +90,7 @@ def entered(problem: Problem, table: Table, c: Carry, wait: Lanes) -> Lane:
                 if free and held:
                     out.append(select(model.held(k, state.mode[k]), found[held][0], found[free][0]))
                 elif free and model.parts[k] > 1:  # those below a corner belong to the slot of its first component
-                    below = found[model.slots[_first(model, k)]][free.part]
+                    below = found[plan.rows[plan.of(k)[0]].free][free.part]
                     out.append(select(state.mode[k] < 0, below, found[free][0]))
                 else:
                     out.append(found[free or held][0])
@@ -117,10 +117,6 @@ def entered(problem: Problem, table: Table, c: Carry, wait: Lanes) -> Lane:
         log=c.log,
         saved=c.saved,
     )
-
-
-def _first(model: SwitchedSystem, k: int) -> int:
-    return next(i for i, slot in enumerate(model.slots) if slot.switch == k)
 
 
 def strange(problem: Problem, modes: tuple[Numbers, ...], also: Truths) -> Truths:
@@ -199,10 +195,8 @@ def logged(log: Log, index: Numbers, when: Truths, row: tuple[Any, ...]) -> Log:
     """`Log.write` for all lanes."""
 
     def put(buffer: Array, value: Array) -> Array:
-        values = value.reshape(-1, value.shape[-1])
-        rows = buffer.reshape(
-            -1, buffer.shape[-1]
-        )  # (each number of a state or mode by itself: to stack them copies all)
+        # Each number of a state or mode by itself: to stack them would copy the whole log.
+        values, rows = (x.reshape(-1, x.shape[-1]) for x in (value, buffer))
         for j, x in enumerate(values):
             rows = _put(rows, select(when, index * len(values) + j, len(rows)), x)
         return rows.reshape(buffer.shape)

@@ -100,10 +100,11 @@ def _crossing(problem: Problem, m: Meeting, k: int) -> Plain:
     beyond = [a - 2 * sign * b for a, b in zip(f, pull)] + f[plan.size :]
     sure = m.rate == m.rate
     for r in rows:
-        falls = (dot(guards[r][:-1], beyond), magnitude(guards[r][:-1], beyond))
-        # The others are above zero, as h is their least.
+        moves = guards[r][:-1]
+        falls = dot(moves, beyond) < -1e2 * tiny * magnitude(moves, beyond)
+        # The other components are above zero, as h is the least of them.
         above = sign * dot(guards[r], z) > tiny * magnitude(guards[r], z)
-        sure = sure & select(m.fires[r], falls[0] < -1e2 * tiny * falls[1], above)
+        sure = sure & select(m.fires[r], falls, above)
     for j in plan.crossed[k]:
         sure = sure & ~model.held(j, m.modes[j])
     one, zero = jnp.ones_like(mode), jnp.zeros_like(mode)
@@ -124,8 +125,8 @@ def _change(problem: Problem, m: Meeting, k: int) -> Plain:
     """A relay that changes, and does not change back at once."""
     plan, mode, (row,) = problem.plan, m.modes[k], problem.plan.of(k)
     z, (on, off) = frozen((m.z, [list(row) for row in problem.constants.levels[k]]))
-    next_one = [select(mode == 0, a, b) for a, b in zip(off, on)]
-    sure = dot(next_one, z) < -small(m.rate) * magnitude(next_one, z)
+    back = [select(mode == 0, a, b) for a, b in zip(off, on)]  # the indicator function by which it would
+    sure = dot(back, z) < -small(m.rate) * magnitude(back, z)
     for j in plan.crossed[k]:
         sure = sure & ~problem.model.held(j, m.modes[j])
     none = jnp.zeros_like(mode)
