@@ -134,6 +134,10 @@ class _Counted(System):
     def switches(self) -> tuple[AbstractSwitch, ...]:
         return tuple(map(forwarded, self.system.switches))
 
+    @property
+    def jumps_in_time(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.system.jumps_in_time
+
 
 def work_precision(
     system: System,

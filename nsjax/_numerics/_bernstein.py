@@ -85,7 +85,7 @@ def _horner(a: list[Array], x: Array) -> Array:
 
 
 def bend(a: list[Array], u: Scalar) -> Scalar:
-    """The second derivative at `u` (which may be a little outside of [0, 1]), up to a positive factor."""
+    """The second derivative at `u` (which may be a little outside of [0, 1])."""
     n = len(a) - 1
     if n < 2:
         return jnp.zeros_like(u)
@@ -93,7 +93,8 @@ def bend(a: list[Array], u: Scalar) -> Scalar:
     c = [w * (z - 2 * y + x) for w, x, y, z in zip(binomials(n - 2), c, c[1:], c[2:])]
     early = u < 0.5
     c = [select(early, x, y) for x, y in zip(c, c[::-1])]
-    return _horner(c, select(early, u, 1 - u) / select(early, 1 - u, u))
+    far = select(early, 1 - u, u)
+    return n * (n - 1) * far ** (n - 2) * _horner(c, select(early, u, 1 - u) / far)
 
 
 def at(a: list[Array], u: Array) -> Array:

@@ -17,6 +17,10 @@ class ModeFlow(System):
     model: SwitchedSystem
     state: ModeState
 
+    @property
+    def jumps_in_time(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return "ignored" if self.model.clocks else "missed"  # ticks are events, at which its arcs end
+
     def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
         return self.model.flow(t, y, self.state)
 

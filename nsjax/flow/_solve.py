@@ -26,6 +26,7 @@ from ..system._checks import check_model, closing_contacts
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, System
+from ..system._ticking import ticking
 from ._arguments import check_numbers, check_span, checked_start, checked_time, given_modes
 from ._diagnosis import explain
 from ._integrator import Integrator
@@ -80,7 +81,7 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     direction = select(t1 >= t0, 1, -1).astype(t0.dtype)
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
-    model = SwitchedSystem(system.assembled(), direction, start, y0).at(start)
+    model = SwitchedSystem(ticking(system.assembled(), t0, y0), direction, start, y0, smooth=True).at(start)
     state, values, forked, result = start_mode(model, start, y0, options.given, frozen(stop - start))
     # (To end on a surface is not plain: none of a map's solutions would be.)
     plain = options.plain and not any(switch.ends for switch in model.switches)
@@ -224,12 +225,12 @@ def _solution(flow: Flow, c: Carry, t0: Scalar, first: ModeState, end_wanted: bo
         system=model.system.owner,
         t0=t0,
         t1=t_end * model.direction,
-        mode0=_row(first.mode),
+        mode0=_row(first.mode)[: model.declared],
         y1=y1,
-        mode1=_row(c.state.mode),
+        mode1=_row(c.state.mode)[: model.declared],
         ts=saved.ts,
         ys=saved.ys,
-        modes=saved.modes,
+        modes=None if saved.modes is None else saved.modes[:, : model.declared],
         events=_events(model, c, first),
         stats={
             "num_steps": c.steps,
@@ -291,13 +292,13 @@ def _events(model: SwitchedSystem, c: Carry, start: ModeState) -> Events:
     return Events(
         t=log.t,
         switch=table[log.slot],
-        mode_before=before,
-        mode_after=log.modes,
+        mode_before=before[:, : model.declared],
+        mode_after=log.modes[:, : model.declared],
         y_before=log.before,
         y_after=log.after,
         transversality=log.transversality,
         num=c.events,
-        names=tuple(k.name for k in model.switches),
+        names=tuple(k.name for k in model.switches[: model.declared]),
     )
 
 

@@ -71,6 +71,10 @@ class _Watched(System):
         # Last: at an instant which it shares with an event the state on the section is that after the event.
         return (*map(forwarded, self.system.switches), _watch(_section_name(self.system), ends))
 
+    @property
+    def jumps_in_time(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.system.jumps_in_time
+
     def vector_field(self, t: Scalar, y: Y, s: SwitchValues) -> Y:
         return self.system.vector_field(t, y, self.system.values(tuple(s[k.name] for k in self.system.switches)))
 

@@ -21,7 +21,7 @@ from ..flow._results import is_okay, raise_if, RESULTS, SolveError
 from ..flow._solve import HINTS
 from ..sweeps._devices import Devices
 from ..sweeps._long_sweep import sweep_in
-from ..system._checks import check_autonomous, check_clocks, check_direction
+from ..system._checks import check_autonomous, check_clocks, check_direction, check_period
 from ..system._system import arrays_of, System
 from ._orbit import Orbit, ravel
 from ._search import Search
@@ -186,6 +186,8 @@ def _check_period(system: System, t0: Scalar, y0: Y, period: Any, order: Any, co
             raise ValueError("Argument `order` must be 1 for an autonomous system; pass the longer `period` instead.")
         return
     check_clocks(system)
+    if concrete:
+        check_period(system, t0, y0)
     if period is not None:
         raise ValueError("Argument `period` must not be given for a forced system; use `order` for a subharmonic.")
     if order is None and not concrete:

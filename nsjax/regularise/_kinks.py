@@ -57,6 +57,10 @@ class Marked(System):
 
         return field(self.bent, {k.name: s[k.name] for k in self.switches})
 
+    @property
+    def jumps_in_time(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.system.jumps_in_time
+
     def _field(self, t: Scalar, y: Y, values: dict[str, Any]) -> Y:
         walk, sent = _program(self.system, t, y, tuple(values[k.name] for k in self.system.switches)), None
         for shape, names in (*self.kinks, (None, ())):

@@ -73,6 +73,10 @@ class _Regularised(System):
         return _field(self.system, t, y, self.put(t, y, s), s)
 
     @property
+    def jumps_in_time(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.system.jumps_in_time
+
+    @property
     def switches(self) -> tuple[AbstractSwitch, ...]:
         return tuple(forwarded(k) for k in self.system.switches if not isinstance(k, sgn))
 
@@ -208,6 +212,7 @@ class _Pulled(System):
 class Banded(_Regularised):
     """See `banded`."""
 
+    jumps_in_time = "missed"  # the multipliers are compared with their bounds
     system: System
     eta: Float[Array, ""] | float
     rate: Float[Array, ""] | float

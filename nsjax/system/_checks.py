@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -153,6 +154,51 @@ def check_clocks(system: System) -> None:
                 f"The period of `{type(system).__name__}` must be a multiple of that of the clock {name}, but they are "
                 f"{period:.10g} and {float(ticks):.10g}."
             )
+
+
+def check_period(system: System, t: Scalar, y: Y) -> None:
+    """Checks, where numbers are known, that a forced system is the same after its `period`: at a few times, for a few
+    states and values of its switches."""
+    if system.period is None or any(isinstance(x, Tracer) for x in jax.tree.leaves((system, t, y))):
+        return
+    names = ["vector_field", *(k.name for k in system.switches if not isinstance(k, clock))]
+    # At irrational parts of the period, so that neither zeros of harmonics nor jumps are met by chance.
+    with jax.ensure_compile_time_eval():
+        changes = _changes(system, t, y)
+    worst = int(np.argmax(changes))
+    if changes[worst] > (1e-5 if t.dtype == jnp.float64 else 1e-2):
+        raise ValueError(
+            f"`{type(system).__name__}.period` is {float(np.asarray(system.period)):.10g}, but `{names[worst]}` is not "
+            "the same one period later. Return the period of all that depends on time: the least common multiple where "
+            "there are several."
+        )
+
+
+@eqx.filter_jit
+def _changes(system: System, t: Scalar, y: Y) -> Array:
+    """By which part of its size, of all such times, each function of a system changes in a period."""
+    leaves, tree = jax.tree.flatten(y)
+    states = [y, jax.tree.unflatten(tree, [x + 1 + 0.1 * i for i, x in enumerate(leaves)])]
+    period = jnp.asarray(system.period, t.dtype)
+    times = t + period * jnp.asarray(np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0]) % 1, t.dtype)
+
+    def values(t: Scalar, y: Y, s: Scalar) -> list[Array]:
+        f = system.vector_field(t, y, system.values(tuple(s for _ in system.switches)))
+        surfaces = [k.surfaces(system, t, y) for k in system.switches if not isinstance(k, clock)]
+        return [jfu.ravel_pytree(tree)[0] for tree in (f, *surfaces)]
+
+    def sampled(times: Array) -> list[Array]:
+        signs = jnp.asarray([1.0, -1.0], t.dtype)
+        rows = [jax.vmap(jax.vmap(values, (0, None, None)), (None, None, 0))(times, y, signs) for y in states]
+        return [jnp.concatenate([jnp.ravel(x) for x in column]) for column in zip(*rows)]
+
+    found = []
+    for now, later in zip(sampled(times), sampled(times + period)):
+        change, size = jnp.abs(now - later), jnp.max(jnp.abs(now), initial=0.0)
+        known = jnp.isfinite(change)
+        change = jnp.max(select(known, change, 0), initial=0.0)
+        found.append(change / select(size > 0, size, 1))
+    return jnp.stack(found)
 
 
 def closing_contacts(model: SwitchedSystem, t: Scalar, y: Y) -> dict[int, Bool[Array, ""]]:

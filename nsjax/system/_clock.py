@@ -1,7 +1,7 @@
 """The switch of time: the instants at which functions of time in a model jump."""
 
 from collections.abc import Callable
-from typing import Any, Self, TYPE_CHECKING
+from typing import Any, ClassVar, Self, TYPE_CHECKING
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
@@ -46,6 +46,7 @@ class clock(AbstractSwitch):
     """
 
     offset_fn: Callable[[Any], Any] | None = None
+    derived: ClassVar[bool] = False  # whether it was not declared but found in the program of a model
 
     if TYPE_CHECKING:
 

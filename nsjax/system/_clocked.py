@@ -36,6 +36,11 @@ class Clocked(eqx.Module):
         """Which switches are of a kind."""
         return tuple(k for k, switch in enumerate(self.switches) if isinstance(switch, kind))
 
+    @property
+    def declared(self) -> int:
+        """How many of its switches are the user's: the first ones. Those behind them are derived clocks."""
+        return len(self.switches) - sum(self._clock(k).derived for k in self.clocks)
+
     def _clock(self, k: int) -> clock:
         switch = self.switches[k]
         assert isinstance(switch, clock)

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._numerics._autodiff import frozen
 from .._numerics._jaxpr import dependence, is_affine, is_constant
 from .._numerics._select import select
 from .._types import Mode, Scalar, Y
@@ -259,18 +258,6 @@ class SwitchedSystem(Clocked):
     def values_and_flow(self, t: Scalar, y: Y, state: ModeState) -> tuple[tuple[Any, ...], Y]:
         """`values` and `flow`, worked out once."""
         return resolved(self._in(state), t, y, state)
-
-    def force(self, t: Scalar, y: Y, state: ModeState) -> Scalar:
-        """The largest component of the terms that make up the field: with it those which cancel where it is held."""
-        self = frozen(self._in(state))
-        t, y = frozen((t, y))
-        s = self.values(t, y, state)
-        size = jax.tree.map(jnp.abs, self.field(t, y, s))
-        for k in self.holdable:
-            unit = tuple(select(i == k, s[k], 0) for i in range(len(s)))
-            pull = jax.jvp(lambda s: self.field(t, y, s), (s,), (unit,))[1]
-            size = jax.tree.map(lambda a, b: a + jnp.abs(b), size, pull)
-        return ft.reduce(jnp.maximum, [jnp.max(x) for x in jax.tree.leaves(size)])
 
     def project(self, t: Scalar, y: Y, state: ModeState, s: tuple[Any, ...] | None = None) -> Y:
         """Removes the drift off the surfaces that hold the solution. `s`: the values there, if they are known."""

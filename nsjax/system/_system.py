@@ -8,7 +8,7 @@ method (2.32)).
 import abc
 import dataclasses
 import inspect
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -92,6 +92,12 @@ class System(eqx.Module):
         """Period of the explicit time dependence [time], to be overridden: `return 2 * jnp.pi / self.omega`. `None`,
         the default, is for an autonomous model."""
         return None
+
+    jumps_in_time: ClassVar[str] = "refused"
+    """What is done about functions of the time that jump or have kinks. The times at which they do are read off the
+    program and met exactly, as by a `clock`; a model that jumps at other times, and has no clock, is "refused" by
+    default, or these are "missed": the control of the step size alone sees them, and may step over them. "ignored":
+    no times are sought at all."""
 
     @property
     def members(self) -> dict[str, Any]:

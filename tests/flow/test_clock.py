@@ -271,21 +271,37 @@ class Jumpy(nsjax.System):
         return y.x - jumps - self.kink * jnp.abs(t % 0.5 - 0.25)
 
 
-UNDECLARED = [("table", "Tsit5"), ("state", "Exponential")]
+class Announced(Jumpy):
+    """The same with a clock."""
+
+    @nsjax.clock
+    def step(self):
+        return 0.37
+
+    @property
+    def switches(self):
+        return (Announced.step, Jumpy.gate)
 
 
-@pytest.mark.parametrize(
-    "at, solver",
-    [
-        pytest.param(at, solver, marks=[pytest.mark.slow] * ((at, solver) not in UNDECLARED))
-        for at in ("floor", "table", "state")
-        for solver in SOLVERS
-    ],
-)
-def test_undeclared(at, solver):
-    """A surface that jumps where nothing tells of it is found, whatever the solver; and one that jumps with the state."""
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_undeclared(solver):
+    """A surface that jumps with the state, where nothing tells of it, is found."""
     with pytest.raises(nsjax.SolveError, match="`Jumpy.gate`|`gate`"):
-        nsjax.solve(Jumpy(**{at: 0.2}), 0.0, 5.0, Motion(1.0, 0.0), solver=SOLVERS[solver])
+        nsjax.solve(Jumpy(state=0.2), 0.0, 5.0, Motion(1.0, 0.0), solver=SOLVERS[solver])
+
+
+@pytest.mark.parametrize("at", ["floor", "table"])
+def test_a_surface_that_jumps_in_time(at):
+    """The times at which it does are read off the program: the solution is that of the model with a clock."""
+    one, two = (
+        nsjax.solve(system(**{at: 0.2}), 0.0, 5.0, Motion(1.0, 0.0), solver=SOLVERS["Tsit5"])
+        for system in (Jumpy, Announced)
+    )
+    np.testing.assert_allclose(flat(one.y1), flat(two.y1), atol=1e-7)
+    gates = [(float(e.t), e.switch) for e in one.events]
+    declared = [(float(e.t), e) for e in two.events if e.mode_before["gate"] != e.mode_after["gate"]]
+    assert len(gates) == len(declared) > 0 and {name for _, name in gates} == {"gate"}
+    np.testing.assert_allclose([t for t, _ in gates], [t for t, _ in declared], atol=1e-7)
 
 
 def test_too_fast_a_clock():
@@ -467,23 +483,21 @@ class Forced(nsjax.System):
         return Motion(y.v, -y.x + self.jump * jnp.floor(t / 0.7) + self.kink * jnp.abs(t % 0.7 - 0.35))
 
 
+@pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("forcing", ["jump", "kink"])
-def test_field_that_jumps_unannounced(forcing):
-    """Methods that look at their error find a jump of the field, and pay for it in steps and in hundreds of tolerances;
-    `Exponential`, which does not, refuses it."""
+def test_field_that_jumps_unannounced(forcing, solver):
+    """The times at which it does are read off the program and met exactly; they are no events of the solution."""
     system = Forced(float(forcing == "jump"), float(forcing == "kink"))
-    for solver, atol in ((dfx.Tsit5(), 1e-5), (nsjax.Taylor(), 1e-6)):
-        sol = nsjax.solve(system, 0.0, 5.0, Motion(0.0, 0.0), solver=solver)
-        edges = np.append(np.arange(0, 5, 0.35), 5.0)
-        y = np.zeros(2)
-        for b, e in zip(edges, edges[1:]):  # x'' = -x + p + q (t - b)
-            p, q = (np.floor((b + e) / 1.4), 0.0) if forcing == "jump" else _triangle(b, e)
-            x, v = y - np.array([p, q])
-            c, s, h = np.cos(e - b), np.sin(e - b), e - b
-            y = np.array([p + q * h + x * c + v * s, q - x * s + v * c])
-        np.testing.assert_allclose(flat(sol.y1), y, atol=atol)
-    sol = nsjax.solve(system, 0.0, 5.0, Motion(0.0, 0.0), solver=nsjax.Exponential(), throw=False)
-    assert sol.result == RESULTS.mode_not_affine
+    sol = nsjax.solve(system, 0.0, 5.0, Motion(0.0, 0.0), solver=SOLVERS[solver])
+    edges = np.append(np.arange(0, 5, 0.35), 5.0)
+    y = np.zeros(2)
+    for b, e in zip(edges, edges[1:]):  # x'' = -x + p + q (t - b)
+        p, q = (np.floor((b + e) / 1.4), 0.0) if forcing == "jump" else _triangle(b, e)
+        x, v = y - np.array([p, q])
+        c, s, h = np.cos(e - b), np.sin(e - b), e - b
+        y = np.array([p + q * h + x * c + v * s, q - x * s + v * c])
+    np.testing.assert_allclose(flat(sol.y1), y, atol=1e-12 if solver == "Exponential" else 2e-7)
+    assert sol.result == RESULTS.successful and len(sol.events) == 0
 
 
 def _triangle(b, e):

@@ -12,7 +12,7 @@ from ...flow._results import is_okay
 from ...orbits._orbit import Orbit
 from ...orbits.segments._equations import field_at, guard_sizes, OrbitCurve
 from ...orbits.segments._itinerary import Start, starts_of
-from ...orbits.segments._segment_flow import exactness, fits, NEVER, SegmentFlow, states_along
+from ...orbits.segments._segment_flow import exactness, SegmentFlow, states_along
 from ...system._model import SwitchedSystem
 from ...system._parameter import FreeParameters, get_parameter, parameter_path
 from ...system._system import arrays_of, System
@@ -53,7 +53,6 @@ def curve_and_start(
         integrator=integrator,
         exact=exactness(model, jnp.asarray(orbit.t0), orbit.y0),
     )
-    curve = dataclasses.replace(curve, exact=_exact(curve, start, value))
     curve = dataclasses.replace(curve, sizes=_sizes(curve, start, value) if told is None else told)
     normal, reference = phase_of(curve, start)
     curve = dataclasses.replace(curve, normal=normal, reference=reference)
@@ -72,14 +71,6 @@ def _segments(curve: OrbitCurve, start: Start, value: float) -> tuple[SegmentFlo
     states = [curve.state(itinerary.mode[i], itinerary.part[i]) for i in itinerary.rows]
     rows = zip(start.begin, start.end, start.x, states)
     return curve.on(itinerary).flow(jnp.asarray(value)), list(rows)
-
-
-def _exact(curve: OrbitCurve, start: Start, value: float) -> int:
-    """Which flows are known by their exponentials, given the forcing along the orbit."""
-    if curve.exact == NEVER:
-        return NEVER
-    flow, rows = _segments(curve, start, value)
-    return curve.exact if all(bool(fits(flow, *row)) for row in rows) else NEVER
 
 
 def _sizes(curve: OrbitCurve, start: Start, value: float) -> np.ndarray:

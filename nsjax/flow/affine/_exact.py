@@ -79,7 +79,7 @@ def _blank(problem: Problem, kept: int, carry: Carry) -> Table:
 
 
 def _table_of(problem: Problem, state: ModeState) -> Table:
-    key = key_of(state.mode) if state.mode else jnp.zeros(problem.constants.frequency.shape, jnp.int32)
+    key = key_of(state.mode) if state.mode else jnp.zeros(problem.constants.squared.shape, jnp.int32)
     return tabulate(problem, state, key)
 
 
@@ -140,7 +140,7 @@ def _general(problem: Problem, table: Table, carry: Carry, lane: Lane) -> tuple[
 
     def back(after: Carry, lane: Lane) -> Lane:
         new = entered(problem, table, after, select(waits, after.dt, lane.wait))
-        stays = waits & ((after.accepted == lane.accepted) | ~problem.constants.fits)
+        stays = waits & (after.accepted == lane.accepted)
         return new._replace(slow=strange(problem, new.modes, stays) & after.active)
 
     dynamic, static = eqx.partition((carry, lane), eqx.is_array)

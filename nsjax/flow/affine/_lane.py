@@ -97,7 +97,7 @@ def entered(problem: Problem, table: Table, c: Carry, wait: Lanes) -> Lane:
             return out
 
         known = by_lane(roots, model, c.state)
-    since = clock(c.t - flow.t0, constants.frequency) if plan.timed else ()
+    since = clock(c.t - flow.t0, constants.squared) if plan.timed else ()
     return Lane(
         t=c.t,
         x=rows_of(c.y),
@@ -107,7 +107,7 @@ def entered(problem: Problem, table: Table, c: Carry, wait: Lanes) -> Lane:
         known=[k.astype(jnp.int32) for k in known],
         index=found_in(table, c.state.mode, c.steps),
         active=c.active,
-        slow=strange(problem, c.state.mode, ~constants.fits),
+        slow=strange(problem, c.state.mode, jnp.zeros_like(c.active)),
         wait=wait,
         moved=jnp.zeros_like(c.active),
         steps=c.steps,

@@ -7,14 +7,12 @@ from typing import NamedTuple
 import diffrax as dfx
 import jax
 import jax.flatten_util as jfu
-import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from ..._numerics._autodiff import frozen
 from ..._numerics._jaxpr import dependence, is_constant
 from ..._numerics._select import select
-from ..._numerics._series import Series
+from ..._numerics._time_dependence import Forcing, forcing, time_dependence
 from ..._types import Scalar, Y
 from ...system._impact import impact
 from ...system._mode import ModeState, put, Slot
@@ -63,7 +61,7 @@ class Plan(NamedTuple):
 class Constants(NamedTuple):
     """What stays the same in all modes, for one lane or with lanes along the last axis."""
 
-    frequency: Scalar  # the square of that of the forcing
+    squared: Scalar  # the square of the angular frequency of the forcing
     push: dict[int, Flat]  # of each switch that can hold: the derivative of the field by its value
     gain: dict[int, Scalar]  # what it adds to its own dh/dt, of contacts d²h/dt²
     level: dict[int, Flat]  # of contacts: dh/dt in flight as a row times z
@@ -71,8 +69,6 @@ class Constants(NamedTuple):
     restitution: dict[int, Scalar]
     pull: dict[int, Columns]  # of each `sgn` switch that is only crossed: the derivative of the field by its value
     levels: dict[int, Columns]  # of relays: the indicator functions of their two surfaces
-    forcing: Columns  # what is left of field and indicator functions at y = 0, as columns for (S, C, 1)
-    fits: Bool[Array, ""]  # whether this stands for them
 
 
 class Problem(NamedTuple):
@@ -116,7 +112,10 @@ def planned(
         fields.append(lambda t, y: model.guards(t, y, state))
     if not all(all(affine_parts(fn, t, y)) for fn in fields):
         return None
-    return model, _plan(model, crossed, state, t, y)
+    plan = _plan(model, crossed, state, t, y)
+    known: list[Forcing | None] = []
+    jax.eval_shape(lambda t: known.append(frequency(model, plan, t, y)), t)  # nothing of it stays in the program
+    return None if known[0] is None or known[0].grows else (model, plan)
 
 
 def pull(model: SwitchedSystem, k: int, s: tuple, t: Scalar, y: Y) -> Y:
@@ -260,23 +259,17 @@ def constants(model: SwitchedSystem, plan: Plan, t: Scalar, y: Y) -> Constants:
             levels[k] = columns(lambda t, x, k=k: jnp.stack(surfaces(model, k, t, unravel(x))), plan, t)
         else:
             pulls[k] = columns(lambda t, x, k=k: _flat(pull(model, k, zeros, t, unravel(x))), plan, t)
-    frequency, forcing, fits = _forcing(model, plan, t, y)
-    return Constants(frequency, push, gain, level, bound, restitution, pulls, levels, forcing, fits)
+    known = frequency(model, plan, t, y)
+    assert known is not None  # it was asked for by `planned`
+    squared = jnp.asarray(known.squared, t.dtype)
+    return Constants(squared, push, gain, level, bound, restitution, pulls, levels)
 
 
-def _forcing(model: SwitchedSystem, plan: Plan, t: Scalar, y: Y) -> tuple[Scalar, Columns, Bool[Array, ""]]:
-    """What depends on time, with b''' = -ω² b': constant, linear, quadratic or harmonic. (Forcing that grows or decays
-    exponentially is left to the general flow: its S and C grow, and cancel.)"""
-    now = raw(model, plan, t, y)
-    if not plan.timed:
-        return jnp.zeros_like(t), now[:, None], jnp.ones((), bool)
-    series = Series(lambda t: [raw(model, plan, t, y)], t)
-    terms = [series.step(k, t if k == 0 else jnp.ones_like(t) if k == 1 else None)[0] for k in range(5)]
-    b1, b2, b3, b4 = (jnp.zeros_like(now) if c is None else w * c for w, c in zip((1.0, 2.0, 6.0, 24.0), terms[1:]))
-    size = b1 @ b1 + b2 @ b2
-    squared = -(b1 @ b3 + b2 @ b4) / select(size == 0, 1, size)
-    fits = frozen(squared) >= 0
-    return select(fits, squared, 0), jnp.stack([b1, b2, now], axis=1), lax.stop_gradient(fits)
+def frequency(model: SwitchedSystem, plan: Plan, t: Scalar, y: Y) -> Forcing | None:
+    """What depends on time: constant, linear or quadratic, or harmonic of one frequency; None if it is anything else,
+    or if it jumps. (Forcing that grows exponentially is left to the general flow: its S and C grow, and cancel.)"""
+    found = time_dependence(lambda t: raw(model, plan, t, y), t)
+    return None if found.jumps or found.unknown else forcing(found.results)
 
 
 def clock(since: Scalar, squared: Scalar) -> tuple[Scalar, Scalar]:

@@ -115,7 +115,7 @@ def tabulate(problem: Problem, state: ModeState, key: Lanes) -> Table:
     matrix, guards, projection = by_lane(
         lambda model, t, y, state: maps(model, plan, t, y, state), model, flow.t0, y, state
     )
-    squared = frozen(constants.frequency)
+    squared = frozen(constants.squared)
     size = spectral_size(frozen(matrix)[:, : plan.size])
     if plan.timed:
         size = jnp.maximum(size, jnp.sqrt(squared))

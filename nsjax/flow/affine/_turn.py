@@ -19,7 +19,7 @@ from ._arc import arrived, dot, full, matrix_rows, Rows, series, TERMS
 from ._isolate import Corner, isolate, last, SOON
 from ._lane import found_in, Lane, logged, state_of
 from ._plain import magnitude, Meeting, Plain, plain, small
-from ._plan import Plan, Problem, raw
+from ._plan import Plan, Problem
 from ._table import by_lane, economised, Table
 
 
@@ -108,7 +108,9 @@ def go(plan: Plan, rows: list[Rows], guards: list[Rows], projection: Any, z: Row
     drift = dot(w0[plan.size : -1], f0[plan.size :]) if plan.timed else nought
     normal, speed = sum(x * x for x in w0[: plan.size]), sum(x * x for x in f0[: plan.size])
     cosine = jnp.abs(rate) / jnp.sqrt((normal + drift**2) * (speed + select(drift == 0, 0, 1)))
-    clear = (rate < -1e2 * small(like) * size) & (cosine > 1e2 * small(like))
+    # What is nearly tangential, by a measure that does not depend on units, is for the general flow to judge.
+    turns = frozen(dot(w0[:-1], bend))
+    clear = (rate < -1e2 * small(like) * size) & (-rate > 1e2 * small(like) * jnp.abs(turns) * arc.length)
     delay, moved = arrived(z, rows, w, event)
     z = [*[stored(x) for x in moved[:-1]], z[-1]]
     return There(z, shift + delay, rate, ~event | (close & clear), cosine, terms)
@@ -121,7 +123,7 @@ def turn(problem: Problem, table: Table, lane: Lane) -> Lane:
     arc = look(plan, table, lane, flow, live)
     n, m = plan.size, plan.width
     matrix = [[picked(table.matrix[:, i, j], lane.index) for j in range(m)] for i in range(n)]
-    rows = matrix_rows(plan, matrix, constants.frequency)
+    rows = matrix_rows(plan, matrix, constants.squared)
     guards = [[stored(picked(table.guards[:, r, q], lane.index)) for q in range(m)] for r in range(len(plan.rows))]
     projection = table.projection
     if projection is not None:
@@ -129,8 +131,6 @@ def turn(problem: Problem, table: Table, lane: Lane) -> Lane:
     there = go(plan, rows, guards, projection, [*lane.x, *lane.clock, jnp.ones_like(lane.t)], arc, theta)
     t = select(arc.final, flow.t1, lane.t + arc.tau + there.shift)
     sure = ~arc.doubtful & there.sure
-    if plan.timed:
-        sure = sure & _as_predicted(problem, t, there.z)
     none = jnp.zeros_like(lane.steps)
     after = Plain(sure, there.z[:n], lane.modes, lane.parts, [none] * len(plan.rows), none, ~live)
     if plan.rows:
@@ -168,16 +168,6 @@ class End(NamedTuple):
     after: Plain
     moved: Truths
     event: Truths
-
-
-def _as_predicted(problem: Problem, t: Lanes, z: Rows) -> Truths:
-    """Whether forcing is what its kind makes of it, which fails after a kink."""
-    _, model, plan, constants, like, _ = problem
-    now = by_lane(lambda model, t, y: raw(model, plan, t, y), *frozen((model, t, like)))
-    columns, clock = frozen((constants.forcing, z[plan.size :]))
-    terms = [columns[:, q] * x for q, x in enumerate(clock)]
-    size = sum(map(jnp.abs, terms[1:]), jnp.abs(terms[0]))
-    return jnp.all(jnp.abs(now - sum(terms[1:], terms[0])) <= 10 * small(t) * size, axis=0)
 
 
 def _moved(plan: Plan, table: Table, lane: Lane, end: End) -> Lane:

@@ -172,7 +172,16 @@ def seen_numbers(model: SwitchedSystem, t: Scalar, y: Y, state: ModeState) -> tu
     return tuple(map(tuple, found.tolist()))
 
 
-def transversality(
+class Encounter(NamedTuple):
+    """How each guard falls, in the mode that ends."""
+
+    cosine: Float[Array, " slots"]  # between the trajectory and the normal of its surface, in time and state
+    rate: Float[Array, " slots"]  # of the guard
+    slack: Float[Array, " slots"]  # what an error of the state within the tolerance makes of it
+    size: Float[Array, " slots"]  # of its terms that depend on the state
+
+
+def encounter(
     model: SwitchedSystem,
     t: Scalar,
     y: Y,
@@ -180,10 +189,8 @@ def transversality(
     part: Int[Array, " slots"],
     tolerance: Any,
     seen: tuple[tuple[int, ...], ...],
-) -> tuple[Float[Array, " slots"], Float[Array, " slots"]]:
-    """Of each guard the cosine between the trajectory and the normal of its surface, in time and state; and what an
-    error of the state within the tolerance (relative, absolute) makes of it. `seen`: `seen_numbers` of a model with
-    many switches, else empty."""
+) -> Encounter:
+    """`tolerance`: relative and absolute. `seen`: `seen_numbers` of a model with many switches, else empty."""
     model, t, y = frozen((model, t, y))
     flat, unravel = jfu.ravel_pytree(y)
 
@@ -193,10 +200,11 @@ def transversality(
         return rows[np.arange(len(model.slots)), part], jfu.ravel_pytree(f)[0]
 
     rtol, atol = tolerance
-    error = atol + rtol * jnp.abs(flat)
+    error, size = atol + rtol * jnp.abs(flat), jnp.abs(flat)
     if not seen:
         (h_t, n), f = jax.jacfwd(guards_and_field, argnums=(0, 1), has_aux=True)(t, flat)
-        return jax.vmap(cosine, (0, 0, None))(h_t, n, f), jnp.abs(n) @ error
+        cosines = jax.vmap(cosine, (0, 0, None))(h_t, n, f)
+        return Encounter(cosines, h_t + n @ f, jnp.abs(n) @ error, jnp.abs(n) @ size)
     table = np.array(seen)
     number = np.arange(len(flat))
     seeds = jnp.asarray([np.isin(number, column) for column in table.T], flat.dtype)
@@ -208,9 +216,14 @@ def transversality(
     n = jax.vmap(lambda dx: moved(jnp.zeros_like(t), dx)[0], out_axes=1)(seeds)
     n, near = select(table < 0, 0, n), jnp.maximum(table, 0)
     # (Sums of a few columns, written out: XLA's products of so short rows take ten times as long.)
-    zero, columns = jnp.zeros_like(h_t), list(zip(n.T, f[near].T, error[near].T))
-    square, along = sum((n * n for n, _, _ in columns), zero), sum((n * f for n, f, _ in columns), zero)
-    return _cosine(h_t, square, along, f @ f), sum((jnp.abs(n) * error for n, _, error in columns), zero)
+    zero, columns = jnp.zeros_like(h_t), list(zip(n.T, f[near].T, error[near].T, size[near].T))
+
+    def total(fn: Any) -> Array:
+        return sum((fn(*column) for column in columns), zero)
+
+    square, along = total(lambda n, f, error, size: n * n), total(lambda n, f, error, size: n * f)
+    slack, terms = (total(lambda n, f, *sizes, i=i: jnp.abs(n) * sizes[i]) for i in (0, 1))
+    return Encounter(_cosine(h_t, square, along, f @ f), h_t + along, slack, terms)
 
 
 def cosine(h_t: Scalar, n: Float[Array, " n"], f: Float[Array, " n"]) -> Scalar:

@@ -8,7 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._numerics._bernstein import bend
+from ..._numerics._bernstein import bend, largest
 from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._clock import clock
@@ -20,7 +20,7 @@ from ...system._sgn import sgn
 from .._results import RESULTS
 from ..steppers._stepper import stack, Stepper
 from ._impact import completed, rebound, slow
-from ._locate import Interval, locate, Located, step_to, transversality
+from ._locate import encounter, Interval, locate, Located, step_to
 from ._mode_choice import settle
 
 
@@ -54,7 +54,8 @@ def transition(
     step: Interval,
 ) -> Transition:
     """Locates the earliest event of a step, of a solution that sets out at time `begin`, and makes the transition.
-    `record`: what dense output is made of, if any; it may be without derivatives. `seen`: see `transversality`."""
+    `tolerance`: relative and absolute. `record`: what dense output is made of, if any; it may be without derivatives.
+    `seen`: see `encounter`."""
     event = _Event(model, begin, step, locate(model, stepper, step))
     event.fire()
     event.jump()
@@ -71,23 +72,29 @@ def transition(
         after = later.project(t_after, after, state)
     state = event.relays_on_their_surfaces(state, after)
     news = jnp.zeros((), bool)
-    for k, switch in enumerate(model.switches):
+    for k, switch in enumerate(model.switches[: model.declared]):
         news = news | (state.mode[k] != step.state.mode[k])
         if isinstance(switch, impact):
             news = news | event.fired[k]
 
     slot, part = event.slot, event.part
-    cosines, slack = transversality(model, t, event.before, step.state, part, tolerance, seen)
-    cosine, missed = cosines[slot], event.missed
+    met = encounter(model, t, event.before, step.state, part, tolerance, seen)
+    cosine, missed = met.cosine[slot], event.missed
     if event.ticks is not None:
         cosine = select(event.ticks, 1, cosine)
         missed = jnp.minimum(missed, select(event.ticks, event.jumped_to(state, after), jnp.inf))
-    # At a cosine c an error δ of h changes c by about δ/c, and the saltation matrix, which grows as 1/c, by δ/c² of
-    # itself. With δ = eps that is as much as c where c is the cube root of eps. A short flight ends with a small cosine
-    # as well, but there h has no minimum, and the derivatives are right.
-    rows = [a[slot, part[slot]] for a in step.polynomials]
-    bends = bend(rows, (t - step.t) / select(halted, 1, step.t_next - step.t)) > 0
-    grazes = event.found & news & ~halted & bends & (cosine < jnp.cbrt(jnp.finfo(t.dtype).eps))
+    # How deep h would fall without the event, if it has a minimum: h'²/(2h''). An error δ of h changes h' by h''δ/h',
+    # and so the saltation matrix by δ/2 over this depth. Where δ, as the tolerance makes it, is a tenth of that, there
+    # might be no event at all. All of this is the same in other units. (A short flight ends with a small rate as well,
+    # but there h has no minimum, and the derivatives are right.)
+    polynomial = [a[slot, part[slot]] for a in step.polynomials]
+    length = select(halted, 1, step.t_next - step.t)
+    bends = lax.stop_gradient(bend(polynomial, (t - step.t) / length))
+    turns = event.found & news & ~halted & (bends > 0)
+    depth = (met.rate[slot] * lax.stop_gradient(length)) ** 2 / (2 * select(turns, bends, 1))
+    rtol = jnp.asarray(0.0 if stepper.exact else tolerance[0], t.dtype)  # NaN for steps of a given length
+    error = jnp.maximum(select(rtol >= 0, rtol, 0), 1e4 * float(jnp.finfo(t.dtype).eps))
+    grazes = turns & (depth < 10 * error * jnp.maximum(largest(polynomial), met.size[slot]))
     points = None
     if record is not None:
         # Once more, to the very event and with the derivatives of where it begins and ends.
@@ -101,15 +108,28 @@ def transition(
         y_after=after,
         f_after=later.flow(t_after, after, state),
         state=state,
-        slot=slot,
+        slot=_reported(model, slot, step.state, state),
         news=news,
         points=points,
         transversality=select(grazes, 0, cosine),  # as it counts from here on
         grazes=grazes,
         forked=forked,
         result=event.result,
-        margin=jnp.min(select(missed < jnp.inf, missed / slack, jnp.inf)),
+        margin=jnp.minimum(
+            jnp.min(select(missed < jnp.inf, missed / met.slack, jnp.inf)),
+            select(turns, depth / met.slack[slot], jnp.inf),
+        ),
     )
+
+
+def _reported(model: SwitchedSystem, slot: Int[Array, ""], before: ModeState, after: ModeState) -> Int[Array, ""]:
+    """The slot of an event as the log names it: where a derived clock ticks, that of a switch whose mode changes."""
+    switches = jnp.asarray([s.switch for s in model.slots])
+    out = slot
+    for k in reversed(range(model.declared)) if model.declared < len(model.switches) else ():
+        changed = (switches[slot] >= model.declared) & (before.mode[k] != after.mode[k])
+        out = select(changed, [s.switch for s in model.slots].index(k), out)
+    return out
 
 
 class _Event:

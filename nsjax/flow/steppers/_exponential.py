@@ -18,9 +18,9 @@ from ..._numerics._bernstein import nodes, to_bernstein, to_chebyshev
 from ..._numerics._jaxpr import is_affine, is_constant
 from ..._numerics._linalg import product
 from ..._numerics._select import select
-from ..._numerics._series import Series
+from ..._numerics._time_dependence import Forcing, forcing, time_dependence
 from ..._types import Scalar, Y
-from ...system._mode import ModeState
+from ...system._mode import ModeState, put
 from ...system._model import SwitchedSystem
 from ._stepper import bernstein, jittered, stack, Step, Stepper, unresolved, Watched, with_multipliers
 
@@ -70,8 +70,8 @@ class AbstractExponential(dfx.AbstractAdaptiveSolver):
 
         t0 = jnp.asarray(t0, jnp.result_type(*jax.tree.leaves(y0)))
         _check_affine(field, t0, y0, "the vector field")
-        ys, error, _, fits = _sampled(field, t0, jnp.asarray(t1 - t0, t0.dtype), y0, field(t0, y0))
-        error = jax.tree.map(lambda e: select(fits, e, jnp.nan), error)
+        timed = _known(forcing(time_dependence(lambda t: field(t, y0), t0).results), "the vector field")
+        ys, error, _ = _sampled(field, t0, jnp.asarray(t1 - t0, t0.dtype), y0, field(t0, y0), timed)
         y1 = ys[-1]
         return y1, error, dict(y0=y0, points=stack(_control_points(ys))), None, dfx.RESULTS.successful
 
@@ -132,12 +132,35 @@ def _check_affine(field: Callable[[Scalar, Y], Y], t: Scalar, y: Y, name: str) -
         )
 
 
+def forcing_of(model: SwitchedSystem, t: Scalar, y: Y) -> Forcing | None:
+    """What depends on time in field and surfaces between the times at which they jump; None if that is nothing which
+    the exponential stands for."""
+    system, dtype = model.system, t.dtype
+    zeros, ones = (tuple(f((), dtype) for _ in model.switches) for f in (jnp.zeros, jnp.ones))
+    units = [put(zeros, (k,), (ones[k],)) for k in range(len(zeros))]
+
+    def program(t: Scalar) -> Any:  # in the time of the user, which is not kept between ticks
+        fields = [system.vector_field(t, y, system.values(s)) for s in (zeros, *units, ones)]
+        return fields, [switch.surfaces(system, t, y) for switch in model.switches]
+
+    return forcing(time_dependence(program, t).results)
+
+
+def _known(timed: Forcing | None, name: str) -> Forcing:
+    if timed is None:
+        raise ValueError(
+            "`Exponential` needs forcing that is constant, linear or quadratic in time, exponential, or harmonic of "
+            f"one frequency (which is one number in the program), but that of {name} is not. Take `nsjax.Taylor()` or "
+            "a Runge-Kutta solver."
+        )
+    return timed
+
+
 def generator(
-    field: Callable[[Scalar, Flat], Flat], t: Scalar, x: Flat, f: Flat, dt: Scalar, force: Scalar | None = None
-) -> tuple[Square, Scalar, Bool[Array, ""]]:
+    field: Callable[[Scalar, Flat], Flat], t: Scalar, x: Flat, f: Flat, dt: Scalar, timed: Forcing
+) -> tuple[Square, Scalar]:
     """The matrix M of a linear system z' = M z with time in units of `dt`, whose first components times the second
-    result are x(t + τ) - x(t), from z = (0, 1) or (0, 1, 0, 0); and whether it stands for the forcing. `force` is the
-    size of the terms of f, if they may cancel.
+    result are x(t + τ) - x(t), from z = (0, 1) or (0, 1, 0, 0). `timed`: what depends on time.
 
     With b the forcing, b''' = -ω² b' for all of the kinds that are allowed, so that
     b(t + τ) - b(t) = b' S(τ) + b'' C(τ), where S' = 1 - ω² C, C' = S: sin(ωτ)/ω and (1 - cos ωτ)/ω².
@@ -145,38 +168,21 @@ def generator(
     matrix = dt * jax.jacfwd(field, argnums=1)(t, x)
     columns = [dt * f]
     clock = jnp.zeros((1, 1), t.dtype)
-    fits = jnp.ones((), bool)
-    if not is_constant(lambda t: field(t, x), t):
-        series = Series(lambda t: [field(t, x)], t)
-        terms = [series.step(k, t if k == 0 else jnp.ones_like(t) if k == 1 else None)[0] for k in range(5)]
-        factorials = (1.0, 1.0, 2.0, 6.0, 24.0)
-        b1, b2, b3, b4 = (jnp.zeros_like(x) if c is None else w * c for w, c in zip(factorials[1:], terms[1:]))
-        size = b1 @ b1 + b2 @ b2
-        squared = -(b1 @ b3 + b2 @ b4) / select(size == 0, 1, size)
-        rate = jnp.sqrt(jnp.abs(squared))
-        fast = rate * jnp.max(jnp.abs(b1)) + jnp.max(jnp.abs(b2))
-        rest = jnp.maximum(
-            jnp.max(jnp.abs(b3 + squared * b1)), jnp.max(jnp.abs(b4 + squared * b2)) / select(rate == 0, 1, rate)
-        )
-        eps = float(jnp.finfo(t.dtype).eps)
-        fits = lax.stop_gradient(rest <= 1e7 * eps * rate * fast)
-        # On a surface that holds the solution forcing cancels; the rounding that is left has no kind.
-        moves = jnp.max(jnp.abs(b1)) * dt**2 + jnp.max(jnp.abs(b2)) * jnp.abs(dt) ** 3
-        # It may pass for forcing that grows exponentially, where its even derivatives happen to be zero.
-        chance = ~fits if force is None else ~fits | (squared < 0)
-        force = jnp.max(jnp.abs(f)) if force is None else force
-        still = moves <= 1e5 * eps * (jnp.max(jnp.abs(x)) + force * jnp.abs(dt))
-        still = lax.stop_gradient(still & chance)
-        fits = fits | still
-        b1, b2, squared = (select(still, 0, value) for value in (b1, b2, squared))
-        columns += [dt**2 * b1, dt**3 * b2]
+    if not timed.constant:
         one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-        clock = jnp.stack([jnp.stack(row) for row in ([zero] * 3, [one, zero, -squared * dt**2], [zero, one, zero])])
+
+        def rate(t: Scalar) -> Flat:
+            return jax.jvp(lambda t: field(t, x), (t,), (one,))[1]
+
+        b1, b2 = jax.jvp(rate, (t,), (one,))
+        columns += [dt**2 * b1, dt**3 * b2]
+        clock = [[zero] * 3, [one, zero, -timed.squared * dt**2], [zero, one, zero]]
+        clock = jnp.stack([jnp.stack(row) for row in clock])
     right = jnp.stack(columns, axis=1)
     scale = lax.stop_gradient(_largest([_largest(column) for column in columns]))
     scale = select(scale > 0, scale, 1)
     below = jnp.zeros((len(columns), len(x)), t.dtype)
-    return jnp.block([[matrix, right / scale], [below, clock]]), scale, fits
+    return jnp.block([[matrix, right / scale], [below, clock]]), scale
 
 
 def _largest(rows: Any) -> Any:
@@ -214,16 +220,16 @@ def expm(m: Square) -> Square:
 
 
 def _sampled(
-    field: Callable[[Scalar, Y], Y], t: Scalar, dt: Scalar, y: Y, f: Y, force: Scalar | None = None
-) -> tuple[list[Y], Y, Scalar, Bool[Array, ""]]:
+    field: Callable[[Scalar, Y], Y], t: Scalar, dt: Scalar, y: Y, f: Y, timed: Forcing
+) -> tuple[list[Y], Y, Scalar]:
     """The states at equal parts of a step, both ends included; what a polynomial through them misses, and how many
-    times what may be missed that is; and whether the forcing is of a kind that is known."""
+    times what may be missed that is. `timed`: see `generator`."""
     x, unravel = jfu.ravel_pytree(y)
 
     def flat(t: Scalar, x: Flat) -> Flat:
         return jfu.ravel_pytree(field(t, unravel(x)))[0]
 
-    m, scale, fits = generator(flat, t, x, jfu.ravel_pytree(f)[0], dt, force)
+    m, scale = generator(flat, t, x, jfu.ravel_pytree(f)[0], dt, timed)
     half = expm(m / (2 * _N))
     whole = half @ half
     z = [jnp.zeros(len(m), x.dtype).at[len(x)].set(1)]
@@ -243,16 +249,7 @@ def _sampled(
     allowed = max(1e-9, 1e4 * eps) * size + 64 * _N * eps * (terms + size)
     error = jnp.maximum(tail, 100 * missed)
     excess = once(_largest(error / select(allowed > 0, allowed, 1)))
-    # Forcing that jumps, or has a kink, is of a known kind before it, and differs from the prediction after it.
-    rate, f1 = scale * (m @ z[-1])[: len(x)], dt * flat(t + dt, x + moves[-1])
-    size = [jnp.max(jnp.abs(v)) for v in (dt * jfu.ravel_pytree(f)[0], f1, rate, eps**0.5 * jnp.max(jnp.abs(m)) * size)]
-    size += [] if force is None else [force * jnp.abs(dt)]
-    allowed = max(1e-6, 64 * eps) * sum(size)
-    if m.shape[0] > len(x) + 1:  # forcing that depends on time is no better known than the time is
-        pace = jnp.max(jnp.abs(m[: len(x), len(x) + 1 :])) * jnp.abs(scale) / select(dt == 0, 1, jnp.abs(dt))
-        allowed = allowed + 8 * eps * jnp.abs(t + dt) * pace
-    fits = fits & lax.stop_gradient(jnp.max(jnp.abs(f1 - rate)) <= allowed)
-    return [unravel(x + move) for move in moves], unravel(error), excess, fits
+    return [unravel(x + move) for move in moves], unravel(error), excess
 
 
 def _control_points(ys: list[Y]) -> list[Y]:
@@ -270,23 +267,25 @@ def _control_points(ys: list[Y]) -> list[Y]:
 class ExponentialStepper(Stepper):
     """Steps of `Exponential` in a mode."""
 
+    exact: ClassVar[bool] = True
     solver: Exponential
+    timed: Forcing | None = None  # what depends on time, once it is made for a model
     slides: bool = eqx.field(static=True, default=True)  # whether the modes that hold are affine too
     degree: int = eqx.field(static=True, default=_N)
 
     def made_for(self, model: SwitchedSystem, state: ModeState, t: Scalar, y: Y) -> "ExponentialStepper":
-        s = model.signs(t, state)
-        _check_affine(lambda t, y: model.field(t, y, s), t, y, f"`{type(model.system.owner).__name__}`")
+        s, owner = model.signs(t, state), f"`{type(model.system.owner).__name__}`"
+        _check_affine(lambda t, y: model.field(t, y, s), t, y, owner)
         slides = all(affine_parts(lambda t, y: model.flow(t, y, state), t, y))
-        return ExponentialStepper(self.solver, slides)
+        return ExponentialStepper(self.solver, _known(forcing_of(model, t, y), owner), slides)
 
     def __call__(
         self, model: SwitchedSystem, state: ModeState, t: Scalar, t_next: Scalar, y: Y, f0: Y, watch: Watched = None
     ) -> Step:
-        force = model.force(t, y, state) if self.slides and model.holdable else None
-        ys, _, excess, fits = _sampled(lambda t, y: model.flow(t, y, state), t, t_next - t, y, f0, force)
+        ys, _, excess = _sampled(lambda t, y: model.flow(t, y, state), t, t_next - t, y, f0, _known(self.timed, ""))
+        fits: Bool[Array, ""] | bool = True
         if not self.slides:
-            fits = fits & ~ft.reduce(jnp.logical_or, [model.held(k, state.mode[k]) for k in model.holdable])
+            fits = ~ft.reduce(jnp.logical_or, [model.held(k, state.mode[k]) for k in model.holdable])
         step = Step(t_next, ys[-1], excess, ys, fits=fits)
         if watch is None or not model.slots:
             return step

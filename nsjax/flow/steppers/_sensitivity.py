@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool
 
 from ..._numerics._autodiff import frozen
 from ..._numerics._barrier import once, stored
+from ..._numerics._jaxpr import is_constant
 from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._mode import ModeState
@@ -103,17 +104,19 @@ def _trusted_jvp(primals: Any, tangents: Any) -> tuple[Scalar, Scalar]:
     worst = once(_of_all_directions(select(step.kept & (worst < jnp.inf), worst, 0), lane) / SLACK)
     # Far below the tolerance the error of one step says little of the next.
     far = select(worst > 0.1, step.length * jnp.maximum(worst, 0.1) ** (-1 / order), jnp.inf)
-    far = jnp.maximum(far, _surely(worst > 1, step))
+    far = jnp.maximum(far, _surely(worst > 1, step, frozen(tangents[0]).model, lane))
     return jnp.minimum(far, trusted(*primals)), jnp.zeros_like(far)
 
 
-def _surely(doubted: Bool[Array, ""], step: Sensed) -> Scalar:
+def _surely(doubted: Bool[Array, ""], step: Sensed, moved: Any, lane: Scalar) -> Scalar:
     """The length over which no derivative of this mode turns by more than `NEVER_BELOW`. Where terms cancel, as in a
-    mode that is held, derivatives that are zero are rounding, which no step is short enough to resolve."""
-    dynamic, static = eqx.partition((step.model, step.state, step.t, step.y), eqx.is_array)
+    mode that is held, derivatives that are zero are rounding, which no step is short enough to resolve. `moved`: the
+    tangent of the model."""
+    dynamic, static = eqx.partition((step.model, step.state, step.t, step.y, moved), eqx.is_array)
+    timed = not is_constant(lambda t: step.model.flow(t, step.y, step.state), step.t)
 
     def length(dynamic: Any) -> Scalar:
-        model, state, t, y = eqx.combine(dynamic, static)
+        model, state, t, y, moved = eqx.combine(dynamic, static)
         x, unravel = jfu.ravel_pytree(y)
         m = jax.jacfwd(lambda x: jfu.ravel_pytree(model.flow(t, unravel(x), state))[0])(x)
         size, rate = jnp.ones_like(t), jnp.full_like(t, jnp.inf)
@@ -123,7 +126,38 @@ def _surely(doubted: Bool[Array, ""], step: Sensed) -> Scalar:
             rate = jnp.minimum(rate, size)
             m = m / select(norm > 0, norm, 1)
             m = m @ m
+        if timed:
+            rate = jnp.maximum(rate, _of_all_directions(_forced_rate(model, moved, state, t, y), lane))
         return select(rate > 0, NEVER_BELOW / select(rate > 0, rate, 1), jnp.inf)
 
     none = jnp.zeros_like(step.t)
     return select(doubted, lax.cond(eqxi.unvmap_any(doubted), length, lambda _: none, dynamic), none)
+
+
+def _forced_rate(model: SwitchedSystem, moved: Any, state: ModeState, t: Scalar, y: Y) -> Scalar:
+    """How fast what drives a derivative changes in time: ∂f/∂p (for the tangent `moved` of the model), which has a time
+    scale of its own where the mode has none, as that of a rigid body, or a slower one. Zero if ∂f/∂p is rounding."""
+    s, zero, one = model.values(t, y, state), jnp.zeros_like(t), jnp.ones_like(t)
+
+    def tangent(fn: Callable[[SwitchedSystem], Y]) -> Array:
+        change = eqx.filter_jvp(fn, (model,), (moved,))[1]
+        leaves = [jnp.zeros_like(x) if d is None else d for x, d in zip(jax.tree.leaves(y), _leaves(change))]
+        return jnp.concatenate([jnp.ravel(x) for x in leaves])
+
+    def drive(t: Scalar) -> Array:
+        return tangent(lambda model: model.flow(t, y, state))
+
+    def slope(t: Scalar) -> tuple[Array, Array]:
+        return jax.jvp(drive, (t,), (one,))
+
+    (value, first), (_, second) = jax.jvp(slope, (t,), (one,))
+    size, first, second = (jnp.max(jnp.abs(x)) for x in (value, first, second))
+    terms = jnp.max(jnp.abs(tangent(lambda model: model.field(t, y, s))))
+    eps = float(jnp.finfo(t.dtype).eps)
+    driven = size > 1e5 * eps * terms
+    size = select(driven, size, one)
+    return select(driven, jnp.maximum(first / size, jnp.sqrt(second / size)), zero)
+
+
+def _leaves(tree: Any) -> list[Any]:
+    return jax.tree.leaves(tree, is_leaf=lambda x: x is None)

@@ -107,6 +107,7 @@ class Stepper(eqx.Module):
 
     solver: eqx.AbstractVar[dfx.AbstractSolver]
     degree: eqx.AbstractVar[int]
+    exact: ClassVar[bool] = False  # whether its error is that of rounding, whatever the tolerances
     group: ClassVar[int] = GROUP  # lanes whose events are worked on together, at least
 
     def made_for(self, model: SwitchedSystem, state: ModeState, t: Scalar, y: Y) -> "Stepper":

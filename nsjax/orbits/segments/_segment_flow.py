@@ -24,10 +24,11 @@ from ...flow._mode_flow import ModeFlow, VariedModeFlow
 from ...flow._results import is_okay
 from ...flow._save import times_between
 from ...flow._solve import integrate
-from ...flow.steppers._exponential import affine_parts, expm, generator
+from ...flow.steppers._exponential import affine_parts, expm, forcing_of, generator
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ...system._parameter import FreeParameters
+from ...system._ticking import ticking
 
 
 TRUSTED = 1e2  # dense output may err by this many tolerances of the steps
@@ -69,9 +70,9 @@ class SegmentFlow(eqx.Module):
 
     def generator(self, a: Scalar, b: Scalar, x: Array, state: ModeState) -> tuple:
         """Of the exact flow from time a to b, see `generator`."""
-        force = self.model.force(a, self.unravel(x), state) if self.slides else None
-        f = self.field(a, x, state)
-        return generator(lambda t, x: self.field(t, x, state), a, x, f, b - a, force)
+        f, timed = self.field(a, x, state), forcing_of(self.model, a, self.unravel(x))
+        assert timed is not None  # see `exactness`
+        return generator(lambda t, x: self.field(t, x, state), a, x, f, b - a, timed)
 
     def arrive(self, a: Scalar, b: Scalar, x: Array, state: ModeState) -> Array:
         """The state at time b of the flow from `x` at time a."""
@@ -99,25 +100,16 @@ class SegmentFlow(eqx.Module):
 
 @interactive
 def exactness(model: SwitchedSystem, t: Scalar, y: Y) -> int:
-    """Which modes have fields that are affine in the state, with a constant matrix. (A program without operations: it
-    is asked once of models of one kind.)"""
+    """Which modes have fields that are affine in the state, with a constant matrix and forcing that the exponential
+    knows. (A program without operations: it is asked once of models of one kind.)"""
     zero = jnp.zeros((), jnp.int32)
     parts = tuple(zero if n > 1 else None for n in model.parts)
     state = ModeState(tuple(zero for _ in model.switches), parts, tuple(zero for _ in model.switches))
     if not all(affine_parts(lambda t, y: model.field(t, y, model.signs(t, state)), t, y)):
         return NEVER
+    if forcing_of(model, t, y) is None or ticking(model.system, t, y) is not model.system:
+        return NEVER
     return ALWAYS if all(affine_parts(lambda t, y: model.flow(t, y, state), t, y)) else FREE_MODES
-
-
-@interactive
-def fits(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeState) -> Array:
-    """Whether the forcing along a segment is of a kind that the exponential knows: at several times, as at one where
-    its odd derivatives vanish two frequencies look like one."""
-
-    def at(t: Scalar) -> Array:
-        return flow.generator(t, t + (b - a), x, state)[2]
-
-    return jnp.all(jax.vmap(at)(a + (b - a) * jnp.asarray([0.0, 0.2764, 0.6180], x.dtype)))
 
 
 @interactive
@@ -138,15 +130,15 @@ def _exponential(
     flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeState
 ) -> tuple[Array, Float[Array, "n n"]]:
     """The state at the end, and its derivative by that at the beginning."""
-    m, scale, good = flow.generator(a, b, x, state)
+    m, scale = flow.generator(a, b, x, state)
     n, e = len(x), expm(m)
-    return select(good, x + scale * e[:n, n], jnp.nan), e[:n, :n]
+    return x + scale * e[:n, n], e[:n, :n]
 
 
 def _samples(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeState) -> Float[Array, "nodes n"]:
     """States at the nodes: from those at equal distances, with three derivatives, by Hermite's polynomials of degree
     seven, which miss a 10321920th of the eighth power of the phase between two of them."""
-    m, scale, good = flow.generator(a, b, x, state)
+    m, scale = flow.generator(a, b, x, state)
     n, step = len(x), expm(m / NODES)
     z = jnp.zeros((len(m), 1), x.dtype).at[n, 0].set(1)
     while z.shape[1] <= NODES:
@@ -160,7 +152,7 @@ def _samples(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeState
     weights = jnp.asarray(_hermite(THETA * NODES - cell), x.dtype)
     rows = [part[:n, cell + k] for k in (0, 1) for part in (z, first, second, third)]
     out = sum(w * row for w, row in zip(weights, rows))
-    return select(good, x[:, None] + scale * out, jnp.nan).T
+    return (x[:, None] + scale * out).T
 
 
 def _hermite(s: np.ndarray) -> np.ndarray:
