@@ -46,8 +46,8 @@ with warnings.catch_warnings():  # of another text for success, which diffrax pr
             "surfaces coincide, or a reset that does not leave its surface, does this."
         )
         mode_not_affine = (
-            "`nsjax.Exponential` met a mode that it cannot step exactly: it slides or rests where the field that does so "
-            "is not affine in the state. Take `nsjax.Taylor()` or a Runge-Kutta solver."
+            "`nsjax.Exponential` met a mode that it cannot step exactly: it slides or rests where the field that does "
+            "so is not affine in the state. Take `nsjax.Taylor()` or a Runge-Kutta solver."
         )
         nonfinite_field = (
             "The vector field or an indicator function returned a value that is not finite (NaN or infinity)."

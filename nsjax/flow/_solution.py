@@ -54,8 +54,9 @@ class Events(eqx.Module, Generic[StateT]):
     - `y_before`, `y_after`: the state on either side, leaves with a leading axis of length `max_events`.
     - `transversality`: how squarely each met its surface: |nᵀf⁻ + h_t| / sqrt((|n|² + h_t²) (|f⁻|² + 1)), the cosine
       between the surface's normal and the trajectory in time and state (without the 1 where h_t = 0), from 0 (tangency,
-      where derivatives do not exist) to 1. Where it is below eps^(1/3) (6e-6; for float32 5e-3) and h has a minimum,
-      not the end of a short flight, the solution's result is `RESULTS.tangential_event`.
+      where derivatives do not exist) to 1, in the units of the state. It is set to 0 where h would fall, without the
+      event, by less than ten times what the relative tolerance (of exact methods, rounding) makes of its size; the
+      solution's result is `RESULTS.tangential_event` then.
     - `num`: how many there were.
     """
 
@@ -206,9 +207,12 @@ class Solution(eqx.Module, Generic[StateT]):
 
     - `margin`: how near it came to an event that did not happen: the least value of an indicator function (or of a
         multiplier's distance from its bound) that fell and rose again, over what an error of the state by the
-        tolerance of a step makes of it. Up to some tens the itinerary is a matter of the tolerance. Infinite where
-        nothing came nearer than a tenth of its own size on a step (of `Affine`: a ten-thousandth, on an arc); a surface
-        of several components is not looked at. NaN for steps of a given length.
+        tolerance of a step makes of it. Or how nearly an event did not happen: by how much an indicator function
+        would have fallen without it, h'²/(2h''), in the same units; derivatives through it are uncertain by about
+        1/(2 margin) of themselves. Up to some tens the itinerary is a matter of the tolerance. Infinite where
+        nothing came nearer than a tenth of its own size on a step (of `Affine`: a ten-thousandth, on an arc, and of
+        events only those that its general loop works out); a surface of several components is not looked at. NaN for
+        steps of a given length.
 
     With `SaveAt(dense=True)`, `sol(t)` is the state at a time, or at each of an array of times; see `evaluate`.
     """
