@@ -180,7 +180,8 @@ class _Reader:
         env: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], values))
 
         def read(v: Any) -> Any:
-            return self._constant(np.asarray(v.val, v.aval.dtype)) if isinstance(v, jex.Literal) else env[v]
+            aval: Any = v.aval
+            return self._constant(np.asarray(v.val, aval.dtype)) if isinstance(v, jex.Literal) else env[v]
 
         for e in jaxpr.eqns:
             env.update(zip(e.outvars, self.equation(e, [read(v) for v in e.invars])))
@@ -409,11 +410,12 @@ def _shaped(form: Form | None, e: Any) -> Form | None:
 
 def _moved(e: Any, x: list[Any]) -> list[Form | None]:
     """The forms of a sum, or of entries that are moved or repeated."""
-    name, none = e.primitive.name, [None] * len(e.outvars)
+    name = e.primitive.name
+    none: list[Form | None] = [None] * len(e.outvars)
     if name in ("add", "add_any", "sub"):
         return [_shaped(_combined(x[0], x[1], -1.0 if name == "sub" else 1.0), e)]
-    forms = [_form(v) for v in x]
-    if any(form is None for form in forms):
+    forms = [form for form in map(_form, x) if form is not None]
+    if len(forms) < len(x):
         return none
     first = forms[0]
     if name == "neg":
@@ -432,8 +434,8 @@ def _moved(e: Any, x: list[Any]) -> list[Form | None]:
         out = e.primitive.bind(*[jnp.broadcast_to(getattr(f, part), s) for f, s in zip(forms, shapes)], **params)
         return list(out) if e.primitive.multiple_results else [out]
 
-    if all(shape == e.outvars[0].aval.shape for shape in shapes):
-        return [first]
+    if name in ("broadcast_in_dim", "reshape", "squeeze") and shapes[0] == e.outvars[0].aval.shape:
+        return [first]  # the same arrays, and not some that are equal
     return [Form(offset, gain, first.base) for offset, gain in zip(moved("offset"), moved("gain"))]
 
 

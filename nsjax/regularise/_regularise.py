@@ -212,10 +212,13 @@ class _Pulled(System):
 class Banded(_Regularised):
     """See `banded`."""
 
-    jumps_in_time = "missed"  # the multipliers are compared with their bounds
     system: System
     eta: Float[Array, ""] | float
     rate: Float[Array, ""] | float
+
+    @property
+    def jumps_in_time(self) -> str:  # multipliers are compared with their bounds
+        return "missed"
 
     def put(self, t: Scalar, y: Y, s: SwitchValues) -> _Values:
         t, y = jnp.asarray(t), jax.tree.map(jnp.asarray, y)

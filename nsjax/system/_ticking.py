@@ -105,15 +105,14 @@ class _CyclicClock(DerivedClock):
 
 
 @ft.cache  # switches are told apart by identity
-def _listed() -> DerivedClock:
+def _listed() -> AbstractSwitch:
     return _ListedClock(lambda system: system.times, name="jumps_in_time")
 
 
 @ft.cache
-def _cyclic(number: int) -> DerivedClock:
+def _cyclic(number: int) -> AbstractSwitch:
     new = _CyclicClock(lambda system: system.cycles[number].period, name=f"jumps_in_time_{number}")
-    new.number = number
-    return new
+    return new._with(number=number)
 
 
 def ticking(system: System, t: Scalar, y: Y) -> System:
@@ -155,6 +154,17 @@ def ticking(system: System, t: Scalar, y: Y) -> System:
         times = _sorted(jnp.concatenate([jnp.ravel(x).astype(t.dtype) for x in found.times]), regular)
     cycles = tuple(_ticks(cycle, t.dtype, regular) for cycle in found.cycles)
     return Ticking(system, times, cycles)
+
+
+def check_jumps_declared(system: System, t: Scalar, y: Y) -> None:
+    """Raises for a system that jumps in time where none of its clocks ticks: for what needs to know these times as
+    events."""
+    if ticking(system, t, y) is not system:
+        owner = type(system.owner).__name__
+        raise ValueError(
+            f"`{owner}` jumps or has kinks at certain times, which branches of its orbits need as events: declare them "
+            "as ticks of a `nsjax.clock`."
+        )
 
 
 def _undeclared(found: TimeDependence, clocks: int) -> TimeDependence:

@@ -392,6 +392,45 @@ def test_many_random_forcings(kind, solver):
     _compare(kind, nsjax.Taylor(), 250, 2, swept=solver == "swept")
 
 
+class SquareWave(nsjax.System):
+    """A damped oscillator with dry friction, pushed by a square wave."""
+
+    T: Array | float = 2.0
+
+    def vector_field(self, t, y, s):
+        push = jnp.where(t % self.T < 0.5 * self.T, 1.0, -1.0)
+        return Motion(y.v, -y.x - 0.2 * y.v + push - 0.05 * s.friction)
+
+    @nsjax.sgn
+    def friction(self, t, y):
+        return y.v
+
+    @property
+    def period(self):
+        return self.T
+
+
+class ClockedSquareWave(SquareWave):
+    @nsjax.clock
+    def tick(self):
+        return self.T / 2
+
+    @property
+    def switches(self):
+        return (SquareWave.friction, ClockedSquareWave.tick)
+
+
+def test_orbits_of_a_square_wave_need_no_clock():
+    """But branches do, and say so."""
+    orbit, clocked = (nsjax.find_orbit(m, Motion(0.0, 0.0), order=1) for m in (SquareWave(), ClockedSquareWave()))
+    np.testing.assert_allclose(orbit.y0, clocked.y0, atol=1e-10)
+    np.testing.assert_allclose(orbit.multipliers, clocked.multipliers, atol=1e-10)
+    phi, clocked_phi = (nsjax.fundamental_matrix(o.system, 0.0, 2.0, orbit.y0) for o in (orbit, clocked))
+    np.testing.assert_allclose(phi, clocked_phi, atol=1e-10)
+    with pytest.raises(ValueError, match="`SquareWave` jumps .* declare them as ticks of a `nsjax.clock`"):
+        nsjax.continue_orbit(SquareWave(), orbit, "T", (1.8, 2.2))
+
+
 def test_a_period_that_is_not_the_period_of_the_forcing():
     class Wrong(nsjax.System):
         def vector_field(self, t, y, s):

@@ -16,6 +16,7 @@ from ...orbits.segments._segment_flow import exactness, SegmentFlow, states_alon
 from ...system._model import SwitchedSystem
 from ...system._parameter import FreeParameters, get_parameter, parameter_path
 from ...system._system import arrays_of, System
+from ...system._ticking import check_jumps_declared
 from .._checks import check_interval, check_precision, checked_scale
 
 
@@ -35,6 +36,7 @@ def curve_and_start(
     value = float(get_parameter(system, path))
     check_interval("interval", (low, high), value, f"of `{parameter}` in `system`")
     told = None if scale is None else checked_scale(orbit.y0, scale)
+    check_jumps_declared(system, jnp.asarray(orbit.t0), orbit.y0)
     model = SwitchedSystem.forwards(system, orbit.t0, orbit.y0, smooth=True)
     (start,) = starts_of(model, [orbit])
     n = len(start.x[0])
