@@ -20,8 +20,12 @@ if jaxlib.__version__.startswith("0.10."):  # an unknown flag ends the process
     quick = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
     whole = "--xla_cpu_parallel_codegen_split_count=1"
     os.environ["XLA_FLAGS"] = f"{quick} {whole} {os.environ.get('XLA_FLAGS', '')}"
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(__file__).parents[1] / ".jax_cache"))
+# JAX writes the entries of its cache in place, and a second process that reads one meanwhile reports that it is cut off.
+# Each worker of pytest therefore has a folder of its own.
+programs = os.environ.get("JAX_COMPILATION_CACHE_DIR") or pathlib.Path(__file__).parents[1] / ".jax_cache"
+jax.config.update(
+    "jax_compilation_cache_dir", str(pathlib.Path(programs, os.environ.get("PYTEST_XDIST_WORKER", "main")))
+)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # half of 5,500 small programs are read then
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")

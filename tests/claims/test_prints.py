@@ -3,7 +3,6 @@
 import html
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from branches import branch_of, special_at
@@ -16,54 +15,60 @@ from nsjax.gallery import Motion
 from nsjax.orbits.segments._arcs import Arcs, Path
 
 
+def array(x, dtype=None):
+    """A JAX array made without a program: this file makes its results while tests are collected."""
+    return jax.device_put(np.asarray(x, dtype))
+
+
 GOOD, BAD = RESULTS.successful, RESULTS.max_events_reached
 BELT = gallery.StickSlip()
-STATE = Motion(jnp.asarray(1.5), jnp.asarray(-0.25))
+STATE = Motion(array(1.5), array(-0.25))
 ARCS = Arcs(
-    jnp.array([0.0, 1.0, 2.0]), jnp.array([1.0, 2.0, 2.0]), jnp.zeros((3, 1), int), Motion(*jnp.ones((2, 3, 4)))
+    array([0.0, 1.0, 2.0]),
+    array([1.0, 2.0, 2.0]),
+    array(np.zeros((3, 1), int)),
+    Motion(*map(array, np.ones((2, 3, 4)))),
 )
 ROWS = Motion(np.array([1.0, 2.0, np.nan]), np.array([-1.0, 0.0, np.nan]))  # the last is none
 
 
 def several(*results):
-    return jax.tree.map(lambda *x: jnp.stack(x), *results)
+    return jax.tree.map(lambda *x: array(np.stack(x)), *results)
 
 
 def orbit(result=GOOD, multipliers=(1, 0.5)):
     events = nsjax.flow.Events(
-        t=jnp.array([1.0, jnp.inf]), switch=jnp.array([0, -1]), mode_before=jnp.array([[-1], [0]]),
-        mode_after=jnp.zeros((2, 1), int), y_before=Motion(jnp.ones(2), jnp.zeros(2)),
-        y_after=Motion(jnp.ones(2), jnp.zeros(2)), transversality=jnp.ones(2), num=jnp.asarray(1), names=("belt",),
+        t=array([1.0, np.inf]), switch=array([0, -1]), mode_before=array([[-1], [0]]),
+        mode_after=array(np.zeros((2, 1), int)), y_before=Motion(array(np.ones(2)), array(np.zeros(2))),
+        y_after=Motion(array(np.ones(2)), array(np.zeros(2))), transversality=array(np.ones(2)), num=array(1), names=("belt",),
     )  # fmt: skip
     return nsjax.Orbit(
-        system=BELT, t0=jnp.asarray(0.0), y0=STATE, mode=jnp.array([-1]), period=jnp.asarray(13.5), events=events,
-        monodromy=jnp.eye(2), multipliers=jnp.array(multipliers, complex), structural_zeros=jnp.asarray(0),
-        stable=jnp.asarray(True), residual=jnp.asarray(1e-15), admissible=jnp.asarray(True),
-        violation=jnp.asarray(0.0), violation_t=jnp.asarray(0.0), arcs=ARCS, result=result, integrator=None,
+        system=BELT, t0=array(0.0), y0=STATE, mode=array([-1]), period=array(13.5), events=events,
+        monodromy=array(np.eye(2)), multipliers=array(multipliers, complex), structural_zeros=array(0),
+        stable=array(True), residual=array(1e-15), admissible=array(True),
+        violation=array(0.0), violation_t=array(0.0), arcs=ARCS, result=result, integrator=None,
     )  # fmt: skip
 
 
 def equilibrium(result=GOOD):
     return nsjax.Equilibrium(
-        system=BELT, y=STATE, mode=jnp.array([0]), multipliers=jnp.array([0.5]), jacobian=jnp.eye(2),
-        eigenvalues=jnp.array([-1 + 1j, jnp.nan]), held=jnp.asarray(1), stable=jnp.asarray(True),
-        admissible=jnp.asarray(True), boundary=jnp.asarray(False), isolated=jnp.asarray(False),
-        residual=jnp.asarray(0.0), result=result,
+        system=BELT, y=STATE, mode=array([0]), multipliers=array([0.5]), jacobian=array(np.eye(2)),
+        eigenvalues=array([-1 + 1j, np.nan]), held=array(1), stable=array(True),
+        admissible=array(True), boundary=array(False), isolated=array(False),
+        residual=array(0.0), result=result,
     )  # fmt: skip
 
 
 def sensitivity(defined):
     itinerary = nsjax.flow.Itinerary(
-        jnp.array([-1]), jnp.array([0, -1]), jnp.zeros((2, 1), int), jnp.asarray(1), ("belt",)
+        array([-1]), array([0, -1]), array(np.zeros((2, 1), int)), array(1), ("belt",)
     )  # fmt: skip
-    return nsjax.derivatives.Sensitivity(
-        STATE, Motion(jnp.asarray(0.3), jnp.ones(3)), itinerary, jnp.asarray(defined), GOOD
-    )
+    return nsjax.derivatives.Sensitivity(STATE, Motion(array(0.3), array(np.ones(3))), itinerary, array(defined), GOOD)
 
 
 CROSSING = nsjax.setvalued.EigenvalueCrossing(0.25, 2j, 1, -1, (2, 0), 0.25)
 CURVE = nsjax.setvalued.EigenvalueCurve("zero", np.array([[0.0, 0.5], [1.0, 0.5]]), np.zeros(2, complex))
-PATH = Path(jnp.array([[0.0, 1.0], [2.0, 2.0]]), Motion(jnp.eye(2), jnp.eye(2)), jnp.zeros((2, 1), int))
+PATH = Path(array([[0.0, 1.0], [2.0, 2.0]]), Motion(array(np.eye(2)), array(np.eye(2))), array(np.zeros((2, 1), int)))
 HALF = HalfBranch(-1, np.array([1, 0]), (STATE, 1.0), np.array([-1 + 0j, np.nan]), 0, True, 1)
 HOPF = Bifurcation(
     kind="Hopf", discontinuous=True, criticality="supercritical", evidence="crossing", by_count="none",
@@ -87,22 +92,24 @@ LANES = nsjax.continuation.OrbitBranches(
     orders=np.ones(1, int), low=ROWS, high=ROWS, multipliers=np.ones((1, 3, 2)), stable=np.ones((1, 3), bool),
     kinds=np.array([["", "fold", ""]]), start=np.zeros(1, int), num=np.array([2]), ends=np.array([["lost", "lost"]]),
 )  # fmt: skip
-JACOBIAN = nsjax.setvalued.GeneralizedJacobian(("left",), jnp.stack([jnp.eye(2), -jnp.eye(2)]), None)
+JACOBIAN = nsjax.setvalued.GeneralizedJacobian(("left",), array([np.eye(2), -np.eye(2)]), None)
 DIAGRAM = nsjax.maps.BruteForce(
-    "omega", jnp.linspace(1.0, 2.0, 4), jnp.ones((4, 2, 5)), Motion(*jnp.ones((2, 4, 2, 5))),
+    "omega", array(np.linspace(1.0, 2.0, 4)), array(np.ones((4, 2, 5))), Motion(*map(array, np.ones((2, 4, 2, 5)))),
     several(*[several(GOOD, BAD)] * 4),
 )  # fmt: skip
 SPECTRUM = nsjax.maps.LyapunovSpectrum(
-    jnp.array([0.06, -jnp.inf]), jnp.array([1e-3, jnp.nan]), jnp.ones((9, 2)), jnp.asarray(3.0), None, STATE, GOOD
+    array([0.06, -np.inf]), array([1e-3, np.nan]), array(np.ones((9, 2))), array(3.0), None, STATE, GOOD
 )
-BASINS = nsjax.maps.Basins(np.array([0, 0, -1]), (Motion(*jnp.ones((2, 1))),), np.ones(3, int), ROWS, np.zeros(3, int))
+BASINS = nsjax.maps.Basins(
+    np.array([0, 0, -1]), (Motion(*map(array, np.ones((2, 1)))),), np.ones(3, int), ROWS, np.zeros(3, int)
+)
 CHART = nsjax.maps.AttractorChart(
     ("omega", "e"), (np.array([1.0, 2.0]), np.array([0.5])), np.array([[2], [0]]), np.array([[0], [-1]]),
     ("wall×2",), np.array([[False], [True]]), np.ones((2, 1)), np.ones((2, 1)), np.ones((2, 1), int), ROWS,
     np.zeros((2, 1), int),
 )  # fmt: skip
-ITERATE = nsjax.maps.Iterate(jnp.asarray(6.25), STATE, jnp.array([-1, 1]), GOOD)
-REDUCED = nsjax.maps.ReducedIterate(jnp.asarray(0.7), STATE, GOOD)
+ITERATE = nsjax.maps.Iterate(array(6.25), STATE, array([-1, 1]), GOOD)
+REDUCED = nsjax.maps.ReducedIterate(array(0.7), STATE, GOOD)
 TABLE = nsjax.WorkPrecision((Row("Tsit5", 1e-6, 0.1, 1e-7, 2.0, None, ""),), 0.0)
 
 # Result, how many lines at most, and what the text begins with and holds.
@@ -144,7 +151,7 @@ CASES = {
     ),
     "a generalized Jacobian": (JACOBIAN, 3, "generalized Jacobian on left", "left < 0: [1 0; 0 1]"),
     "a large one": (
-        nsjax.setvalued.GeneralizedJacobian((), jnp.eye(50), None), 2, "generalized Jacobian on no surface", "50 rows, entries 0 to 1",
+        nsjax.setvalued.GeneralizedJacobian((), array(np.eye(50)), None), 2, "generalized Jacobian on no surface", "50 rows, entries 0 to 1",
     ),
     "a diagram": (DIAGRAM, 4, "brute-force diagram over omega = 1 to 2", "4 max_events_reached, 4 successful"),
     "diagrams": (several(DIAGRAM, DIAGRAM), 4, "2 brute-force diagrams over omega", "values 4, starts 2"),
@@ -152,7 +159,7 @@ CASES = {
     "iterates": (several(ITERATE, ITERATE._replace(result=BAD)), 3, "2 iterates from t = 6.25", "1 max_events_reached"),
     "an iterate of a reduced map": (REDUCED, 4, "iterate of a reduced map\n  values  0.7\n", "from    x = 1.5, v = -0.25"),
     "many": (several(*[REDUCED] * 64), 4, "64 iterates of a reduced map\n  values  0.7\n", "64 successful"),
-    "none": (jax.tree.map(lambda x: x[None][:0], ITERATE), 3, "0 iterates from t = none", "result  none"),
+    "none": (jax.tree.map(lambda x: array(np.asarray(x)[None][:0]), ITERATE), 3, "0 iterates from t = none", "result  none"),
     "a sensitivity": (sensitivity(True), 5, "sensitivity\n", "derivative  x = 0.3, v[0] = 1, v[1] = 1, v[2] = 1"),
     "none at a grazing": (sensitivity(False), 5, "sensitivity that is not defined\n", "belt -1 -> belt +0"),
     "sensitivities": (several(sensitivity(True), sensitivity(False)), 5, "2 sensitivities, 1 of them defined", "x = 0.3,"),
