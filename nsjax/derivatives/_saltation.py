@@ -7,12 +7,13 @@ import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics._autodiff import frozen
 from .._numerics._select import select
 from .._types import Scalar, Y
 from ..flow._arguments import checked_state, checked_time
+from ..flow._results import raise_if, RESULTS
 from ..flow._solution import Events
 from ..flow.events._impact import completed, rebound
 from ..system._impact import impact
@@ -124,12 +125,16 @@ def _unless_rounding(x: Array, blur: Array) -> Array:
     return x - lax.stop_gradient(select(jnp.abs(x) < blur, x, 0))
 
 
-def _matrix(model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after: tuple) -> Float[Array, "n n"]:
+def _matrix(
+    model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after: tuple
+) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """S = DR - f⁺ Dρ + (f⁺ (1 + Dρ f⁻ + ρ_t) - DR f⁻ - R_t) nᵀ / (nᵀ f⁻ + h_t): (3.32) for an event that takes the time
     ρ, as impacts do that lead to rest. Then P S, with the linearised projection P onto the contact.
 
     A perturbation δ before the event moves its time by dt = -nᵀδ / (nᵀf⁻ + h_t), the state after it by
     DR (δ + f⁻ dt) + R_t dt, and the time from which that goes on with f⁺ by dt + Dρ (δ + f⁻ dt) + ρ_t dt.
+
+    Also returned: whether the surface is met tangentially, up to rounding, so that S is infinite.
     """
     j = _jump(model, t, y, k, before, after)
     late = 1 + j.drest @ j.f_before + j.rest_t  # how much later the state of rest begins when the impact does
@@ -137,17 +142,20 @@ def _matrix(model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after
     turn = jnp.outer(_unless_rounding(j.f_after * late - j.dr @ j.f_before - j.r_t, blur), j.n)
     # At a tangency the matrix is infinite, but what does not depend on the time of the event stays as it is.
     speed = j.n @ j.f_before + j.h_t
+    tangential = (jnp.abs(speed) <= jnp.abs(j.n) @ j.blur[0] + _part(j.h_t)) & jnp.any(turn != 0)
     none = (turn == 0) & (speed == 0)
     terms = j.dr, -jnp.outer(j.f_after, j.drest), select(none, 0, turn / select(none, 1, speed))
     size = sum(map(jnp.abs, terms), jnp.zeros_like(turn))
     jump = _unless_rounding(sum(terms, jnp.zeros_like(turn)), _part(size))
     if not isinstance(model.switches[k], impact):
-        return jump
-    return _unless_rounding(j.onto @ jump, _part(jnp.abs(j.onto) @ size))
+        return jump, tangential
+    finite = jnp.all(jnp.isfinite(jump))  # else zeros of the projection would make NaN of what is infinite
+    projected = _unless_rounding(j.onto @ select(finite, jump, 0), _part(jnp.abs(j.onto) @ select(finite, size, 0)))
+    return select(finite, projected, jump), tangential
 
 
 def saltation_matrix(
-    system: System, t: Any, y: Y, switch: str, mode_before: Any, mode_after: Any
+    system: System, t: Any, y: Y, switch: str, mode_before: Any, mode_after: Any, *, throw: bool = True
 ) -> Float[Array, "n n"]:
     """The saltation matrix of an event, by which the fundamental matrix jumps: Φ(t+) = S Φ(t-).
 
@@ -162,11 +170,14 @@ def saltation_matrix(
     - `t`, `y`: time and state at the event, before a jump of the state.
     - `switch`: the name of the switch whose surface is met, or whose multiplier reaches its bound.
     - `mode_before`, `mode_after`: the modes, as `{"name": value}`, one value a switch, or for one switch its value.
+    - `throw`: whether a tangency is an error. Without it the matrix has entries that are infinite, or as large as
+        rounding lets them be.
 
     **Returns:** the matrix, for the state flattened by `ravel_pytree` (fields of a `NamedTuple` in order), in units of
     one state component over another.
 
-    **Raises:** `ValueError` for an unknown switch.
+    **Raises:** `ValueError` for an unknown switch; with `throw` a runtime error if the surface is met tangentially, up
+    to rounding, and the matrix depends on the time of the event.
     """
     names = [k.name for k in system.switches]
     if switch not in names:
@@ -176,18 +187,20 @@ def saltation_matrix(
     system = arrays_of(system, t.dtype)
     model = SwitchedSystem.forwards(system, t, y)
     before, after = _modes(system, mode_before), _modes(system, mode_after)
-    return _matrix(model, t, y, names.index(switch), before, after)
+    matrix, tangential = _matrix(model, t, y, names.index(switch), before, after)
+    return raise_if(tangential, RESULTS.tangential_event, matrix) if throw else matrix
 
 
 def saltation_matrices(system: System, events: Events) -> Float[Array, "events n n"]:
-    """`saltation_matrix` of every event of a log; rows past the last event are NaN."""
+    """`saltation_matrix` of every event of a log; rows past the last event are NaN. At a tangency the entries that
+    depend on the time of the event are infinite, or as large as rounding lets them be."""
     dtype = events.t.dtype
     system = arrays_of(system, dtype)
     template = jax.tree.map(lambda x: x[0], events.y_before)
     model = SwitchedSystem(system, jnp.ones((), dtype), jnp.zeros((), dtype), template)
 
     def one(t: Scalar, y: Y, switch: Array, before: Array, after: Array) -> Array:
-        options = [_matrix(model, t, y, k, tuple(before), tuple(after)) for k in range(len(model.switches))]
+        options = [_matrix(model, t, y, k, tuple(before), tuple(after))[0] for k in range(len(model.switches))]
         missing = jnp.full((len(jfu.ravel_pytree(y)[0]),) * 2, jnp.nan, dtype)
         return jnp.select([switch == k for k in range(len(options))], options, jnp.nan) if options else missing
 

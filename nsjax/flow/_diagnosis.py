@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._numerics._select import select
-from .._numerics._text import components, written
+from .._numerics._text import components, counted, written
 from .._types import Y
 from ..system._checks import closing_contacts
+from ..system._impact import impact
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
 from ._results import RESULTS
@@ -44,11 +45,37 @@ def explain(system: Any, sol: Solution) -> str:
             f"s.{name} >= 0 opens the gap `{name}`, but it closes it. Change its sign, or that of what `{name}` "
             "returns: it must be positive while the contact is open."
         )
+    elif result == RESULTS.stuck_in_events:
+        text = f"{text} (At {where}, where these fired: {_fired(sol)}.)"
+    elif result == RESULTS.wrong_reset and (timed := _timed(system, sol)):
+        text = (
+            f"`{type(system).__name__}.{timed}` depends on the time alone: no reset of the state leaves its surface. "
+            "Count the time down in a state of its own, which the reset sets back; where a function of time in the "
+            f"model jumps, declare a `nsjax.clock`. (At {where}.)"
+        )
     elif result == RESULTS.jump_in_time:
         text = f"{_jumping(system, sol)} at {where}. {text.partition(') ')[2] or text}"
     else:
         text = f"{text} (At {where}.)"
     return " ".join(text.split())
+
+
+def _fired(sol: Solution) -> str:
+    """The switches of the events at the end of a solution, with how many each had: `2 floor, 1 belt`."""
+    events, t1 = sol.events, float(sol.t1)
+    ts = np.asarray(events.t[: int(events.num)])
+    late = np.abs(ts - t1) <= 1e-9 * (abs(t1 - float(sol.t0)) + abs(t1))
+    return counted(events.names[k] for k in np.asarray(events.switch[: len(ts)])[late])
+
+
+def _timed(system: Any, sol: Solution) -> str | None:
+    """An impact with a reset whose gap does not depend on the state."""
+    for switch in system.switches:
+        if isinstance(switch, impact) and switch.reset_fn is not None:
+            gaps = jax.jacfwd(lambda y: switch.components(system, sol.t1, y))(sol.y1)
+            if not any(np.any(leaf) for leaf in jax.tree.leaves(gaps)):
+                return switch.name
+    return None
 
 
 def _pieces(system: Any, t: Any, y: Y, mode: Any) -> list[tuple[str, list[tuple[str, Any]]]]:

@@ -140,6 +140,13 @@ def _controller(
             raise ValueError(f"{source} must have {name} >= 0, but got {name} = {value}.")
     if len(values) == 2 and not any(values.values()):
         raise ValueError(f"{source} must have a tolerance above zero, but rtol = atol = 0.")
+    for name, bound, allowed in (
+        ("dtmax", "above zero", jnp.greater),
+        ("dtmin", "of at least zero", jnp.greater_equal),
+    ):
+        limit = getattr(controller, name, None)
+        if eqx.is_array_like(limit) and not isinstance(limit, Tracer) and not allowed(limit, 0):
+            raise ValueError(f"{source} must have a step `{name}` {bound}, but got {name} = {float(limit)}.")
     rtol = getattr(controller, "rtol", None)
     # A step of size one is rounded by about eps; its error estimate by a few times that. (Inside `jit` the
     # tolerance may have no value yet.)

@@ -202,8 +202,9 @@ class Solution(eqx.Module, Generic[StateT]):
         |λ| > 1), behind a two-fold (where the surface that it slides on has come to repel), and if it runs backwards
         and slides or rests. That static friction which holds goes on doing so until |λ| = b is its law, no choice; how
         elements on coinciding surfaces share their load does not count: the motion is the same. Where five or more
-        switches are at their surfaces, only assignments are looked at that differ in one of them. Derivatives are those
-        among solutions of the same choice.
+        switches are at their surfaces, only assignments are looked at that differ in one of them. It is False, too,
+        after impacts on several contacts at one instant of which one changes the velocity at which another closes:
+        they rebound in the order of their declaration. Derivatives are those among solutions of the same choice.
 
     - `margin`: how near it came to an event that did not happen: the least value of an indicator function (or of a
         multiplier's distance from its bound) that fell and rose again, over what an error of the state by the

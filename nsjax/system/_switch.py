@@ -39,12 +39,12 @@ class AbstractSwitch(abc.ABC):
 
     def __init__(self, guard: Guard, *, name: str | None = None):
         if not callable(guard):
-            raise TypeError(f"A `{type(self).__name__}` must decorate a method `h(self, t, y)`, but got {guard!r}.")
+            raise TypeError(f"`{type(self).__name__}` must decorate a method `h(self, t, y)`, but got {guard!r}.")
         self.guard = guard
         self.name = name or getattr(guard, "__name__", "")
         if not self.name.isidentifier() or self.name == "<lambda>":
             raise ValueError(
-                f"A `{type(self).__name__}` needs a name that is an identifier, but got {self.name!r}; pass `name=...`."
+                f"`{type(self).__name__}` needs a name that is an identifier, but got {self.name!r}; pass `name=...`."
             )
 
     def __set_name__(self, owner: type, name: str) -> None:

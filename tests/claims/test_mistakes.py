@@ -76,6 +76,11 @@ AT_ONCE = {
         ValueError,
         "must have rtol >= 0, but got rtol = -1.0",
     ),
+    "no step": (
+        lambda: run(stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6, dtmax=0.0)),
+        ValueError,
+        "must have a step `dtmax` above zero, but got dtmax = 0.0",
+    ),
     "no tolerance": (lambda: run(stepsize_controller=pid(0.0)), ValueError, "tolerance above zero"),
     "rtol below rounding": (lambda: run(stepsize_controller=pid(1e-17)), ValueError, "Loosen the tolerance"),
     "a number for a controller": (
@@ -241,3 +246,25 @@ def test_modes_of_every_kind_of_integer():
     for value in (1, np.int32(1), np.int64(1), jnp.asarray(1, jnp.int32)):
         for mode in ({"belt": value}, [value]):
             assert run(mode=mode, throw=False).result == nsjax.RESULTS.wrong_mode
+
+
+class Kicked(nsjax.System):
+    """An oscillator that is kicked at t = 1, written as an impact on the time."""
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x)
+
+    @nsjax.impact
+    def kick(self, t, y):
+        return 1 - t
+
+    @kick.reset
+    def kick(self, t, y):
+        return Motion(y.x, y.v + 1)
+
+
+def test_a_reset_at_a_given_time_is_told_what_to_write():
+    with pytest.raises(
+        SolveError, match="`Kicked.kick` depends on the time alone.*in a state of.*`nsjax.clock`.*t = 1,"
+    ):
+        run(Kicked(), t1=2.0)

@@ -105,7 +105,7 @@ compiled = eqx.filter_jit(saltation_matrix)
 def formula(system, t, y, switch, *modes):
     """One program a class of system and a switch."""
     system, t, y, modes = jax.tree.map(jnp.asarray, (system, float(t), y, modes))
-    return compiled(system, t, y, switch, *modes)
+    return compiled(system, t, y, switch, *modes, throw=False)
 
 
 def differences(fn, y, *, h=4e-3):
@@ -231,7 +231,25 @@ def test_transversality_of_a_log():
 def test_a_tangency_is_infinite_not_floored():
     """Pitfall 10."""
     s = formula(gallery.StickSlip(), 0.0, Motion(1.0, 0.2), "belt", -1, 1)  # x' = 0.2, v' = -x + F_slip = 0
-    assert not np.isfinite(s).all()
+    assert not np.isfinite(s).all() and not np.isnan(s).any()
+    with pytest.raises(nsjax.SolveError, match="met tangentially"):
+        saltation_matrix(gallery.StickSlip(), 0.0, Motion(1.0, 0.2), "belt", -1, 1)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e6])
+def test_a_tangential_impact_is_told_in_any_unit(unit):
+    """An impact at no velocity and at one that rounding cannot tell from it; at a small one the matrix is right."""
+    plate = Racket(a=0.0, g=-unit)
+
+    def at(v):
+        return plate, 1.3, Motion(0.0, v * unit), "plate", 0, 0
+
+    for v in (0.0, -1e-18):
+        with pytest.raises(nsjax.SolveError, match="met tangentially"):
+            saltation_matrix(*at(v))
+        matrix = saltation_matrix(*at(v), throw=False)
+        assert abs(matrix[1, 0]) > 1e15 and matrix[0, 1] == 0 and not np.isnan(matrix).any()
+    np.testing.assert_allclose(saltation_matrix(*at(-1e-9)), [[-0.7, 0], [-1.7e9, -0.7]], rtol=1e-12)
 
 
 def test_what_cancels_is_zero():

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -381,6 +382,74 @@ def test_accumulation_on_a_corner_is_told():
     assert sol.result == RESULTS.accumulation_reached
     np.testing.assert_allclose(sol.t1, accumulation(0.6, 9.81, 1.0), rtol=1e-12)
     np.testing.assert_allclose(flat(sol.y1), 0, atol=1e-12)
+
+
+class Row(NamedTuple):
+    """Of three balls."""
+
+    x: Array
+    v: Array
+
+
+class Balls(nsjax.System):
+    """Three balls of length and mass 1 in a row, with the contacts between them declared in either order."""
+
+    reversed: bool = eqx.field(static=True, default=False)
+
+    def vector_field(self, t, y, s):
+        return Row(y.v, jnp.stack([-s.left, s.left - s.right, s.right]))
+
+    @property
+    def switches(self):
+        pairs = (("left", 0), ("right", 1))
+        contacts = [
+            nsjax.impact(lambda self, t, y, i=i: y.x[i + 1] - y.x[i] - 1, name=name).restitution(lambda self: 0.5)
+            for name, i in pairs
+        ]
+        return tuple(contacts[::-1] if self.reversed else contacts)
+
+
+def test_where_the_order_of_declaration_decides_the_solution_is_not_unique():
+    """Impacts on both sides of a ball at one instant: unique exactly where the order of declaration changes nothing."""
+    cases = {
+        "from both sides": ([0.0, 2.0, 4.0], [1.0, 0.0, -1.0]),
+        "both gaps close, one ball at rest": ([0.0, 2.0, 4.0], [1.0, 0.5, 0.0]),
+        "touching, from both sides": ([0.0, 1.0, 2.0], [1.0, 0.0, -1.0]),
+        "touching, unequal": ([0.0, 1.0, 2.0], [1.0, 0.5, 0.0]),
+        "two that rest on each other are hit": ([0.0, 2.0, 3.0], [1.0, 0.0, 0.0]),
+        "one after the other": ([0.0, 2.0, 3.5], [1.0, 0.0, 0.0]),
+    }
+    unique = {}
+    for name, (x, v) in cases.items():
+        start = Row(jnp.asarray(x), jnp.asarray(v))
+        one, two = (solve(Balls(reversed=way), 0.0, 3.0, start) for way in (False, True))
+        same = bool(jnp.allclose(one.y1.v, two.y1.v, atol=1e-9))
+        assert bool(one.unique) == bool(two.unique) == same, name
+        unique[name] = same
+    assert list(unique.values()) == [False] * 4 + [True] * 2
+
+
+def test_an_impact_in_a_corner_is_unique():
+    """Both walls are met at once, but neither impulse changes the velocity towards the other wall."""
+
+    class Corner(nsjax.System):
+        def vector_field(self, t, y, s):
+            return Row(y.v, jnp.stack([s.wall, s.floor]))
+
+        @nsjax.impact
+        def wall(self, t, y):
+            return y.x[0]
+
+        @nsjax.impact
+        def floor(self, t, y):
+            return y.x[1]
+
+        wall = wall.restitution(lambda self: 0.5)
+        floor = floor.restitution(lambda self: 0.5)
+
+    sol = solve(Corner(), 0.0, 2.0, Row(jnp.ones(2), -jnp.ones(2)))
+    assert sol.unique and sol.events.num == 2
+    np.testing.assert_allclose(sol.y1.v, 0.5, rtol=1e-12)
 
 
 def test_start_by_mode():

@@ -263,8 +263,11 @@ def test_thermostat():
 
 def test_relay_without_hysteresis_is_told():
     chatters = Thermostat(T_high=18.0)
-    sol = solve(chatters, 0.0, 10.0, Heat(16.0), mode={"heater": 1}, stepsize_controller=pid(1e-10), throw=False)
+    how = dict(mode={"heater": 1}, stepsize_controller=pid(1e-10))
+    sol = solve(chatters, 0.0, 10.0, Heat(16.0), **how, throw=False)
     assert sol.result == RESULTS.stuck_in_events
+    with pytest.raises(nsjax.SolveError, match=r"where these fired: \d+ heater\.\)"):
+        solve(chatters, 0.0, 10.0, Heat(16.0), **how)
 
 
 # Section 2.1: fields are constant on both sides, for which one step of Euler's method is exact.

@@ -243,7 +243,7 @@ def test_arguments_of_saltation_matrix():
 
 
 def test_switches():
-    with pytest.raises(TypeError, match=r"A `sgn` must decorate a method `h\(self, t, y\)`, but got 1.0"):
+    with pytest.raises(TypeError, match=r"`sgn` must decorate a method `h\(self, t, y\)`, but got 1.0"):
         nsjax.sgn(1.0)
     with pytest.raises(ValueError, match="needs a name that is an identifier"):
         nsjax.impact(lambda self, t, y: y.x)

@@ -94,10 +94,10 @@ def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) ->
     return hit(s)
 
 
-def slow(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
-    """What rounding can make of dh/dt of switch k along the flow."""
+def slow(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState, f: Y | None = None) -> Scalar:
+    """What rounding can make of dh/dt of switch k along the flow. `f`: the field there, if it is known."""
     model, t, y = frozen((model, t, y))
-    f = model.flow(t, y, state)
+    f = model.flow(t, y, state) if f is None else frozen(f)
     terms = model.sizes(lambda t, y: model.h(k, t, y), t, y, jnp.ones_like(t), f)
     return 64 * jnp.finfo(t.dtype).eps * terms[0 if state.part[k] is None else state.part[k]]
 

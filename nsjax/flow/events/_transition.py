@@ -1,5 +1,6 @@
 """What an event does to the state and the mode."""
 
+import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -8,6 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..._numerics._autodiff import frozen
 from ..._numerics._bernstein import bend, largest
 from ..._numerics._select import select
 from ..._types import Scalar, Y
@@ -59,6 +61,7 @@ def transition(
     event = _Event(model, begin, step, locate(model, stepper, step))
     event.fire()
     event.jump()
+    contested = event.is_contested()
     later = event.later = model.within(tuple(event.modes))  # after a tick what depends on time is another function
     for k, switch in enumerate(model.switches):
         if isinstance(switch, sgn):
@@ -113,7 +116,7 @@ def transition(
         points=points,
         transversality=select(grazes, 0, cosine),  # as it counts from here on
         grazes=grazes,
-        forked=forked,
+        forked=forked | contested,
         result=event.result,
         margin=jnp.minimum(
             jnp.min(select(missed < jnp.inf, missed / met.slack, jnp.inf)),
@@ -192,6 +195,24 @@ class _Event:
                 hit = rebound(model, k, t, before, touching)
                 now_and_then = hit, (self.after, self.size)
                 self.after, self.size = jax.tree.map(lambda a, b, now=now: select(now, a, b), *now_and_then)
+
+    def is_contested(self) -> Bool[Array, ""]:
+        """Whether an impact changes the speed at which another contact, met at the same instant, closes: which of the
+        two rebounds first then decides the outcome, and only the order of declaration says so."""
+        model, t, contested = self.model, self.t, jnp.zeros((), bool)
+        impacts = tuple(model.of_kind(impact))
+        if len(impacts) < 2:
+            return contested
+        before, after = frozen((self.before, self.after))
+        fields = [frozen(model.flow(t, y, self.state)) for y in (before, after)]
+        for k in impacts:
+            other = ft.reduce(jnp.logical_or, [self.fired[j] for j in impacts if j != k])
+            h, noise = model.least(k, t, before), jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, before))
+            speeds = [model.approach(k, t, y, self.state, f) for y, f in zip((before, after), fields)]
+            least = jnp.maximum(*[slow(model, k, t, y, self.state, f) for y, f in zip((before, after), fields)])
+            meets = (self.state.mode[k] == 0) & (jnp.abs(h) <= 1e4 * noise) & (jnp.minimum(*speeds) < -least)
+            contested = contested | (other & meets & (jnp.abs(speeds[1] - speeds[0]) > least))
+        return frozen(contested)
 
     def meet(self, k: int) -> None:
         """Whether a `sgn` switch is at its surface, and if an impact or a tick took it off, on which side it is."""

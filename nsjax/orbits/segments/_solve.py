@@ -74,7 +74,7 @@ def by_segments(
     # Where a free segment begins it is tangential that it must be.
     meant = jnp.roll(jnp.asarray(guess.free), -1)
     happened = jnp.isfinite(events.t)
-    grazes = jnp.any(happened & ~meant & (events.transversality < jnp.cbrt(jnp.finfo(end.dtype).eps)))
+    grazes = jnp.any(happened & ~meant & (events.transversality == 0))
     violation, violation_t = _violation(still, itinerary, here)
     admissible = (violation == 0) & jnp.all(end - begin >= -1e3 * newton.tol * (1 + jnp.abs(period)))
     result = RESULTS.where((result == RESULTS.successful) & grazes, RESULTS.tangential_event, result)
@@ -166,22 +166,41 @@ def _states_at(
 
 
 def _log(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, linear: Linear) -> Events:
-    """The events between the segments."""
+    """The events between the segments; the transversality of one that is a grazing, as `solve` counts it, is zero."""
     begin, end, x, _ = curve.parts(u)
     model, last, pieces = curve.model, slice(curve.pieces - 1, None, curve.pieces), curve.pieces
     num = (itinerary.num - 1) // pieces
     rows = jax.tree.map(lambda column: column[last], itinerary._replace(num=()))
     happened = jnp.arange(len(rows.slot), dtype=num.dtype) < num
 
-    def square(t: Scalar, x: Array, mode: Array, part: Array, slot: Array, entry: Array) -> Scalar:
+    largest = jnp.max(jnp.abs(frozen(x)), axis=0)
+
+    def transversality(
+        t: Scalar, x: Array, mode: Array, part: Array, slot: Array, entry: Array, length: Scalar
+    ) -> Scalar:
         state = curve.state(mode, part)
-        h_t, n = jax.grad(lambda t, x: curve.guard(model, t, x, state, slot, entry), argnums=(0, 1))(t, x)
-        f = ravel(model.flow(t, curve.unravel(x), state))
-        return cosine(h_t, n, f)
+
+        def guard(t: Scalar, x: Array) -> Scalar:
+            return curve.guard(model, t, x, state, slot, entry)
+
+        def rate(t: Scalar, x: Array) -> tuple[Scalar, Array]:
+            f = ravel(model.flow(t, curve.unravel(x), state))
+            return jax.jvp(guard, (t, x), (jnp.ones_like(t), f))[1], f
+
+        h_t, n = jax.grad(guard, argnums=(0, 1))(t, x)
+        speed, f = rate(t, x)
+        bend = jax.jvp(lambda t, x: rate(t, x)[0], (t, x), (jnp.ones_like(t), f))[1]
+        # Whether rounding decides that there is an event: how deep the guard would fall below zero without it, against
+        # its size. (The size of a guard that is zero at all events is that of its bend.)
+        depth = speed**2 / (2 * select(bend > 0, bend, 1))
+        size = jnp.abs(n) @ largest + 0.5 * jnp.abs(bend) * length**2
+        grazes = (bend > 0) & (depth < 1e5 * float(jnp.finfo(t.dtype).eps) * size)
+        return select(grazes, 0, cosine(h_t, n, f))
 
     switch = jnp.asarray([slot.switch for slot in model.slots] or [-1], jnp.int32)[rows.slot]
     t, y = frozen((end[last], linear.last[last]))
-    cosines = jax.vmap(square)(t, y, rows.mode, rows.part, rows.slot, rows.entry)
+    lengths = frozen(end.reshape(-1, pieces)[:, -1] - begin.reshape(-1, pieces)[:, 0])
+    cosines = jax.vmap(transversality)(t, y, rows.mode, rows.part, rows.slot, rows.entry, lengths)
     # (Where impacts accumulate the next segment begins later than this one ends.)
     columns = dict(
         t=jnp.roll(begin[::pieces], -1),
