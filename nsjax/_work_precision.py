@@ -111,7 +111,7 @@ def methods_for(system: System) -> dict[str, Method]:
         "events, Dopri8": Method(dfx.Dopri8()),
         "events, Taylor": Method(Taylor()),
     }
-    frictions = [k for k in system.switches if isinstance(k, sgn)]
+    frictions = [k for k in system.switches if isinstance(k, sgn) and not k.jumps]
     if frictions:
         if all(k.bound(system) == 1 for k in frictions):
             found["arctan, ε = 1e4"] = Method(dfx.Kvaerno5(), lambda s: smoothed(s, 1e4))

@@ -154,3 +154,43 @@ def dependence(fn: Callable[[Any], Any], x: Any) -> np.ndarray:
     masks = [bits[start:end].reshape(shape) for start, end, shape in zip(ends, ends[1:], shapes)]
     found = [int(_union(m)) for m in _masks(jaxpr, masks)[0]]
     return np.array([[bool(marks & bit) for bit in bits] for marks in found], bool).reshape(len(found), len(bits))
+
+
+_NOT_NEGATIVE = frozenset("abs cosh exp exp2 logistic sqrt square".split())
+_KEEPING_SIGN = frozenset(MOVING) | frozenset(
+    "add add_any convert_element_type copy cumsum div max min mul pow reduce_max reduce_min reduce_precision "
+    "select_n stop_gradient".split()
+)
+
+
+def never_negative(fn: Callable[[Any], Any], x: Any) -> list[bool]:
+    """Which leaves of `fn(x)` are sums, products and the like of squares, absolute values and exponentials, so that
+    they cannot be negative whatever `x` is."""
+    jaxpr = jax.make_jaxpr(fn)(x).jaxpr
+    return _never_negative(jaxpr, [False] * len(jaxpr.invars))
+
+
+def _never_negative(jaxpr: Any, inputs: list[bool]) -> list[bool]:
+    known = dict(zip(jaxpr.invars, inputs))
+
+    def read(v: Any) -> bool:
+        return bool(np.all(np.asarray(v.val) >= 0)) if isinstance(v, jex.Literal) else known.get(v, False)
+
+    for e in jaxpr.eqns:
+        name, have = e.primitive.name, [read(v) for v in e.invars]
+        inner = [p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr)]
+        if name in CALLS and len(inner) == 1:
+            out = _never_negative(inner[0].jaxpr, have)
+        elif name == "select_n":
+            out = [all(have[1:])]
+        elif name == "max":
+            out = [any(have)]
+        elif name == "pow":
+            out = [have[0]]
+        elif name == "mul" and e.invars[0] is e.invars[1]:
+            out = [True]
+        else:
+            even = name == "integer_pow" and e.params["y"] % 2 == 0
+            out = [name in _NOT_NEGATIVE or even or (name in _KEEPING_SIGN and all(have))]
+        known.update(zip(e.outvars, out if len(out) == len(e.outvars) else out * len(e.outvars)))
+    return [read(v) for v in jaxpr.outvars]

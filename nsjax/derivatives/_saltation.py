@@ -49,9 +49,11 @@ def event_function(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeSt
 def after_event(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState, after: tuple) -> tuple[Y, Scalar]:
     """The state after an event of switch k at `t`, `y`, and how long the impacts that lead to rest take together."""
     none = jnp.zeros_like(t)
-    if not isinstance(model.switches[k], impact):
+    if not model.switches[k].jumps:
         return y, none
     bounced, _ = rebound(model, k, t, y, state)
+    if not isinstance(model.switches[k], impact):
+        return bounced, none
     # (Between two ticks: a segment that follows may be the first of the next period.)
     after = tuple(state.mode[j] if j in model.clocks else m for j, m in enumerate(after))
     free = jnp.zeros_like(after[k])

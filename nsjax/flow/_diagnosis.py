@@ -17,6 +17,7 @@ from ..system._checks import closing_contacts
 from ..system._impact import impact
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
+from ..system._sgn import sgn
 from ._results import RESULTS
 from ._solution import Solution
 
@@ -50,8 +51,8 @@ def explain(system: Any, sol: Solution) -> str:
     elif result == RESULTS.wrong_reset and (timed := _timed(system, sol)):
         text = (
             f"`{type(system).__name__}.{timed}` depends on the time alone: no reset of the state leaves its surface. "
-            "Count the time down in a state of its own, which the reset sets back; where a function of time in the "
-            f"model jumps, declare a `nsjax.clock`. (At {where}.)"
+            f"Declare a `nsjax.clock` of the times at which it is zero, and reset the state by `@{timed}.reset` of the "
+            f"clock. (At {where}.)"
         )
     elif result == RESULTS.jump_in_time:
         text = f"{_jumping(system, sol)} at {where}. {text.partition(') ')[2] or text}"
@@ -71,7 +72,7 @@ def _fired(sol: Solution) -> str:
 def _timed(system: Any, sol: Solution) -> str | None:
     """An impact with a reset whose gap does not depend on the state."""
     for switch in system.switches:
-        if isinstance(switch, impact) and switch.reset_fn is not None:
+        if isinstance(switch, (impact, sgn)) and switch.reset_fn is not None:
             gaps = jax.jacfwd(lambda y: switch.components(system, sol.t1, y))(sol.y1)
             if not any(np.any(leaf) for leaf in jax.tree.leaves(gaps)):
                 return switch.name

@@ -30,8 +30,8 @@ with warnings.catch_warnings():  # of another text for success, which diffrax pr
         )
         accumulation_reached = (
             "Impacts accumulated (Zeno): infinitely many in a finite time, on a surface that cannot hold the "
-            "solution (its h is a tuple, or the contact force does not occur in `vector_field`). `sol.t1` and "
-            "`sol.y1` hold the time and the state at the accumulation point."
+            "solution (its h is a tuple, the contact force does not occur in `vector_field`, or it is crossed with a "
+            "reset). `sol.t1` and `sol.y1` hold the time and the state at the accumulation point."
         )
         repulsive_sliding = (
             "The start lies on a surface that repels (2.25) but can hold the solution too, which is therefore not "

@@ -50,13 +50,18 @@ def _pulled(switch: sgn) -> sgn:
     return forwarded(switch)._with(guard=guard)
 
 
+def _slides(switch: AbstractSwitch) -> bool:
+    """Whether it is a sign that is replaced; one whose events reset the state remains."""
+    return isinstance(switch, sgn) and not switch.jumps
+
+
 def _height(switch: AbstractSwitch, system: System, t: Scalar, y: Y) -> Scalar:
     return ft.reduce(jnp.minimum, switch.components(system, t, y))
 
 
 def _field(system: System, t: Scalar, y: Y, friction: _Values, others: _Values) -> Y:
     """The vector field of `system` with the values of its `sgn` switches from one place, of the others from another."""
-    values = [(friction if isinstance(k, sgn) else others)[k.name] for k in system.switches]
+    values = [(friction if _slides(k) else others)[k.name] for k in system.switches]
     return system.vector_field(t, y, system.values(tuple(values)))
 
 
@@ -78,7 +83,7 @@ class _Regularised(System):
 
     @property
     def switches(self) -> tuple[AbstractSwitch, ...]:
-        return tuple(forwarded(k) for k in self.system.switches if not isinstance(k, sgn))
+        return tuple(forwarded(k) for k in self.system.switches if not _slides(k))
 
     @property
     def period(self) -> Float[Array, ""] | float | None:
@@ -94,7 +99,7 @@ class Smoothed(_Regularised):
     offset: dict[str, Float[Array, ""] | float] = eqx.field(default_factory=dict)
 
     def put(self, t: Scalar, y: Y, s: SwitchValues) -> dict[str, Any]:
-        frictions = [k for k in self.system.switches if isinstance(k, sgn)]
+        frictions = [k for k in self.system.switches if _slides(k)]
         return {k.name: _CURVES[self.kind](self.eps * _height(k, self.system, t, y)) for k in frictions}
 
     def vector_field(self, t: Scalar, y: Y, s: SwitchValues) -> Y:
@@ -206,7 +211,7 @@ class _Pulled(System):
 
     @property
     def switches(self) -> tuple[AbstractSwitch, ...]:
-        return tuple(_pulled(k) for k in self.system.switches if isinstance(k, sgn))
+        return tuple(_pulled(k) for k in self.system.switches if _slides(k))
 
 
 class Banded(_Regularised):
@@ -287,7 +292,7 @@ def _positive(name: str, value: Any) -> Any:
 def _frictions(system: Any) -> list[sgn]:
     """The `sgn` switches of a system, of which there must be one."""
     check_system(system)
-    found = [k for k in system.switches if isinstance(k, sgn)]
+    found = [k for k in system.switches if _slides(k)]
     if not found:
         others = ", ".join(f"`{k.name}`" for k in system.switches)
         raise ValueError(

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Int
 from .._numerics._select import select
 from .._types import Guard, Scalar, Y
 from ._mode import ModeState, Slot
-from ._switch import AbstractSwitch
+from ._switch import ResettingSwitch
 
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ._system import System
 
 
-class clock(AbstractSwitch):
+class clock(ResettingSwitch):
     """The times at which functions of time in the model jump: a carrier, a square wave, a table of set points.
 
     ```python
@@ -34,6 +34,11 @@ class clock(AbstractSwitch):
     `jnp.where` or a table, if the instants at which this jumps (or has a kink) are ticks of a clock. They are met
     exactly: a step ends there, the model is taken from before the tick and from after it, and the modes of all switches
     are decided anew. Derivatives by the times of the ticks are those of the flow.
+
+    With `@carrier.reset`, `y_after = reset(self, t, y_before)`, the state jumps at each tick: a dose, a kick, the
+    sample of a controller. Functions of time in the reset are those after the tick. A tick at the time at which a
+    solution starts has passed before it, in either direction of time; one at its end belongs to it. Backwards in time
+    `@carrier.inverse` is needed.
 
     Its mode is the number of ticks that have passed, counted from time 0 (or from the first of a list), and so is its
     value in `vector_field`.
@@ -103,6 +108,7 @@ class clock(AbstractSwitch):
 
     def check(self, system: "System", t: Scalar, y: Y, along: Callable[[Scalar], Y]) -> None:
         owner = type(system).__name__
+        self._check_reset(system, t, y)
         ticks = jnp.asarray(self.guard(system))
         if ticks.ndim > 1 or ticks.size == 0 or not jnp.issubdtype(ticks.dtype, jnp.floating):
             raise ValueError(

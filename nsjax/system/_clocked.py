@@ -32,6 +32,11 @@ class Clocked(eqx.Module):
         self.switches = system.switches
         self.clocks = self.of_kind(clock)
 
+    @property
+    def jumping(self) -> tuple[int, ...]:
+        """The switches whose events change the state."""
+        return tuple(k for k, switch in enumerate(self.switches) if switch.jumps)
+
     def of_kind(self, kind: type[AbstractSwitch]) -> tuple[int, ...]:
         """Which switches are of a kind."""
         return tuple(k for k, switch in enumerate(self.switches) if isinstance(switch, kind))

@@ -1,10 +1,8 @@
 """The switch of unilateral contact: the state jumps where the gap closes, and may come to rest on the surface."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, Self, TYPE_CHECKING
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
@@ -12,7 +10,7 @@ from .._numerics._jaxpr import is_constant
 from .._numerics._select import select
 from .._types import Guard, Scalar, Y
 from ._mode import ModeState, Slot
-from ._switch import AbstractSwitch
+from ._switch import ResettingSwitch
 
 
 if TYPE_CHECKING:
@@ -20,11 +18,7 @@ if TYPE_CHECKING:
     from ._system import System
 
 
-def _shapes(tree: Any) -> Any:
-    return jax.tree.map(lambda x: f"{x.dtype.name}{list(x.shape)}", tree)
-
-
-class impact(AbstractSwitch):
+class impact(ResettingSwitch):
     """A unilateral contact h >= 0 at which the state jumps (Table 1.1 (3)).
 
     ```python
@@ -48,25 +42,19 @@ class impact(AbstractSwitch):
     modes = (0, 1)
     order = 2
     holding = 1
-    reset_fn: Guard = None
-    inverse_fn: Guard = None
     restitution_fn: Callable[[Any], Any] | None = None
 
     if TYPE_CHECKING:
 
         def __new__(cls, guard: Guard, *, name: str | None = None) -> "_Impact": ...
 
-    def reset(self, fn: Guard) -> Self:
-        """Decorates `reset(self, t, y) -> y_after`, of the structure of the state."""
-        return self._with(reset_fn=fn)
-
-    def inverse(self, fn: Guard) -> Self:
-        """Decorates `inverse(self, t, y) -> y_before`, which undoes `reset`: for solutions backwards in time."""
-        return self._with(inverse_fn=fn)
-
     def restitution(self, fn: Callable[[Any], Any]) -> Self:
         """Decorates `e(self)`, Newton's coefficient of restitution (dimensionless, 0 <= e <= 1)."""
         return self._with(restitution_fn=fn)
+
+    @property
+    def jumps(self) -> bool:
+        return True
 
     def value(self, mode: Int[Array, ""], dtype: Any) -> Scalar:
         return jnp.zeros((), dtype)  # the contact force of a flight
@@ -93,19 +81,9 @@ class impact(AbstractSwitch):
                 f"`{owner}.{name}` is an impact: give it either `@{name}.reset` (the state after it) or "
                 f"`@{name}.restitution` (Newton's coefficient e)."
             )
-        if self.inverse_fn is not None and self.reset_fn is None:
-            raise ValueError(
-                f"`{owner}.{name}.inverse` undoes a reset, but there is no `@{name}.reset`; Newton's law needs none."
-            )
-        if self.reset_fn is not None:
-            for part, fn in (("reset", self.reset_fn), ("inverse", self.inverse_fn or self.reset_fn)):
-                after, want = jax.eval_shape(partial(fn, system, t, y)), jax.eval_shape(lambda: y)
-                if jax.tree.structure(after) != jax.tree.structure(want) or _shapes(after) != _shapes(want):
-                    raise ValueError(
-                        f"`{owner}.{name}.{part}` must return a state of the structure {_shapes(want)}, but returned "
-                        f"{_shapes(after)}."
-                    )
-        elif is_constant(along, jnp.zeros_like(t)):
+        self._check_sign(system, t, y)
+        self._check_reset(system, t, y)
+        if self.reset_fn is None and is_constant(along, jnp.zeros_like(t)):
             raise ValueError(
                 f"`{owner}.{name}.restitution` needs the direction of the impulse, which is that of the contact force "
                 f"`s.{name}` in `vector_field`, but it does not occur there. Add it to the equation of motion "
@@ -117,14 +95,6 @@ class impact(AbstractSwitch):
             return []
         e = jnp.asarray(self.restitution_fn(system))
         return [(".restitution", "a number from 0 to 1", (e >= 0) & (e <= 1), e)]
-
-    def one_way(self, owner: str) -> str | None:
-        if self.reset_fn is None or self.inverse_fn is not None:
-            return None
-        return (
-            f"`{owner}.{self.name}` has a reset, which does not tell the state before it from the one after it; to run "
-            f"it backwards in time, give the state before it by `@{self.name}.inverse`."
-        )
 
 
 if TYPE_CHECKING:

@@ -78,7 +78,8 @@ class SwitchedSystem(Clocked):
         for k, row in zip(hard, self._reach(hard, second, zeros)):
             if row[k]:  # a force that acts on the gap of its own contact
                 reach[k] = row
-        may = [(n == 1 or k in hard) and k not in crossed for k, n in enumerate(order)]
+        slides = [n == 1 and not switch.jumps for n, switch in zip(order, self.switches)]
+        may = [(slides[k] or k in hard) and k not in crossed for k in range(len(order))]
         self.holdable = tuple(k for k in range(len(order)) if may[k] and reach[k, k])
         self.contacts = tuple(k for k in self.holdable if order[k] == 2)
         self.holding = tuple(self.switches[k].holding for k in self.holdable)

@@ -10,7 +10,7 @@ from .._numerics._jaxpr import is_affine
 from .._numerics._select import select
 from .._types import Guard, Scalar, Y
 from ._mode import BEYOND, ModeState, OFF, Slot
-from ._switch import AbstractSwitch
+from ._switch import ResettingSwitch
 
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ._system import System
 
 
-class sgn(AbstractSwitch):
+class sgn(ResettingSwitch):
     """A switch whose value lies in Sgn(h): +1 where h > 0, -1 where h < 0, and anything between on the surface h = 0.
 
     ```python
@@ -30,6 +30,23 @@ class sgn(AbstractSwitch):
     A solution may cross the surface or slide on it. During sliding the value is the multiplier λ which keeps h = 0,
     eq. (2.19)-(2.20); `vector_field` must be affine in it. `@belt.breakaway` gives the bound b >= 1 which |λ| must
     reach before sliding ends: b = F_stick / F_slip is the static friction point of friction model (c), Fig. 2.5.
+
+    With `@middle.reset`, `y_after = reset(self, t, y_before)`, the state jumps where h changes its sign, from either
+    side: a block that rocks over its two edges, play in a gear, the reset of a phase.
+
+    ```python
+    @nsjax.sgn
+    def middle(self, t, y):        # on which edge the block stands
+        return y.theta
+
+    @middle.reset
+    def middle(self, t, y):
+        return State(y.theta, self.r * y.omega)
+    ```
+
+    Nothing slides on such a surface: after the jump the value is the sign of h, or on the surface that of dh/dt, so
+    that the state may go on or turn back. Where its events accumulate, the solution ends with
+    `RESULTS.accumulation_reached`. `@middle.inverse` undoes the reset, for solutions backwards in time.
 
     **Arguments:**
 
@@ -126,6 +143,16 @@ class sgn(AbstractSwitch):
     def check(self, system: "System", t: Scalar, y: Y, along: Callable[[Scalar], Y]) -> None:
         owner = type(system).__name__
         self._check_guard(system, self.name, self.guard, t, y)
+        self._check_reset(system, t, y)
+        if self.jumps:
+            self._check_sign(system, t, y)
+            # What acts beside a surface that cannot hold the solution need not be affine in the value.
+            if self.breakaway_fn or self.condition or len(self.components(system, t, y)) > 1:
+                raise ValueError(
+                    f"`{owner}.{self.name}` has a `reset`: its surface must be one scalar, without `breakaway` and "
+                    "`while_`."
+                )
+            return
         if not is_affine(along, jnp.zeros_like(t)):
             raise ValueError(
                 f"`{owner}.vector_field` must be affine in `s.{self.name}`, because the sliding field (2.19) is the "

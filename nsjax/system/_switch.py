@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self, TYPE_CHECKING
 import jax
 from jaxtyping import Array, Bool, Int
 
+from .._numerics._jaxpr import never_negative
 from .._numerics._select import select
 from .._types import Guard, Scalar, Y
 from ._mode import ModeState, pick, Slot
@@ -67,6 +68,11 @@ class AbstractSwitch(abc.ABC):
     def surfaces(self, system: "System", t: Scalar, y: Y) -> tuple[Scalar, ...]:
         """All indicator functions at whose zeros its mode may change."""
         return self.components(system, t, y)
+
+    @property
+    def jumps(self) -> bool:
+        """Whether its events change the state."""
+        return False
 
     def value(self, mode: Int[Array, ""], dtype: Any) -> Scalar:
         """What `vector_field` is given for it in a mode, unless it holds the solution."""
@@ -144,6 +150,60 @@ class AbstractSwitch(abc.ABC):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name})"
+
+
+class ResettingSwitch(AbstractSwitch):
+    """A switch whose events may change the state by a function of the user's."""
+
+    reset_fn: Guard = None
+    inverse_fn: Guard = None
+
+    def reset(self, fn: Guard) -> Self:
+        """Decorates `reset(self, t, y) -> y_after`, of the structure of the state."""
+        return self._with(reset_fn=fn)
+
+    def inverse(self, fn: Guard) -> Self:
+        """Decorates `inverse(self, t, y) -> y_before`, which undoes `reset`: for solutions backwards in time."""
+        return self._with(inverse_fn=fn)
+
+    @property
+    def jumps(self) -> bool:
+        return self.reset_fn is not None
+
+    def _check_sign(self, system: "System", t: Scalar, y: Y) -> None:
+        if all(never_negative(lambda at: self.components(system, *at), (t, y))):
+            raise ValueError(
+                f"`{type(system).__name__}.{self.name}` is never negative (a square, an absolute value), so that a "
+                "solution touches its zero without crossing it, and no event is found there. Return the gap with its "
+                "sign. For a jump where a surface is crossed from either side write `@nsjax.sgn` with "
+                f"`@{self.name}.reset`."
+            )
+
+    def _check_reset(self, system: "System", t: Scalar, y: Y) -> None:
+        owner, name = type(system).__name__, self.name
+        if self.inverse_fn is not None and self.reset_fn is None:
+            raise ValueError(f"`{owner}.{name}.inverse` undoes a reset, but there is no `@{name}.reset`.")
+        for part, fn in (("reset", self.reset_fn), ("inverse", self.inverse_fn)):
+            if fn is None:
+                continue
+            after, want = jax.eval_shape(partial(fn, system, t, y)), jax.eval_shape(lambda: y)
+            if jax.tree.structure(after) != jax.tree.structure(want) or _shapes(after) != _shapes(want):
+                raise ValueError(
+                    f"`{owner}.{name}.{part}` must return a state of the structure {_shapes(want)}, but returned "
+                    f"{_shapes(after)}."
+                )
+
+    def one_way(self, owner: str) -> str | None:
+        if self.reset_fn is None or self.inverse_fn is not None:
+            return None
+        return (
+            f"`{owner}.{self.name}` has a reset, which does not tell the state before it from the one after it; to run "
+            f"it backwards in time, give the state before it by `@{self.name}.inverse`."
+        )
+
+
+def _shapes(tree: Any) -> Any:
+    return jax.tree.map(lambda x: f"{x.dtype.name}{list(x.shape)}", tree)
 
 
 @ft.cache  # switches are told apart by identity

@@ -265,6 +265,6 @@ class Kicked(nsjax.System):
 
 def test_a_reset_at_a_given_time_is_told_what_to_write():
     with pytest.raises(
-        SolveError, match="`Kicked.kick` depends on the time alone.*in a state of.*`nsjax.clock`.*t = 1,"
+        SolveError, match="`Kicked.kick` depends on the time alone.*`nsjax.clock`.*`@kick.reset` of the clock.*t = 1,"
     ):
         run(Kicked(), t1=2.0)

@@ -94,7 +94,8 @@ def planned(
     """
     if not isinstance(meter, dfx.NoProgressMeter) or len(model.switches) > MOST_SWITCHES:
         return None
-    if any(switch.condition or not isinstance(switch, (sgn, impact, relay)) for switch in model.switches):
+    kinds = (sgn, impact, relay)
+    if any(s.condition or not isinstance(s, kinds) or (isinstance(s, sgn) and s.jumps) for s in model.switches):
         return None
     zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
     crossed = tuple(k for k in range(len(zeros)) if not _simple(model, k, t, y) and _let_through(model, k, t, y))

@@ -1,5 +1,6 @@
 """The jump of an impact: one rebound, and the sum of all that follow up to rest."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ from ..._types import Scalar, Y
 from ...system._impact import impact
 from ...system._mode import ModeState, OFF, put
 from ...system._model import SwitchedSystem
+from ...system._switch import ResettingSwitch
 
 
 def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> tuple[Y, Y]:
@@ -25,14 +27,13 @@ def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) ->
     the impact too, up to where it stops the sliding. Backwards in time Newton's law is inverted (1/e).
     """
     switch = model.switches[k]
-    assert isinstance(switch, impact)
-    if switch.reset_fn is not None:
+    if isinstance(switch, ResettingSwitch) and switch.reset_fn is not None:
         out = switch.reset_fn(model.system, model.time(t), y)
         if switch.inverse_fn is not None:
             undone = switch.inverse_fn(model.system, model.time(t), y)
             out = jax.tree.map(lambda a, b: select(model.direction > 0, a, b), out, undone)
         return out, jax.tree.map(lambda a, b: jnp.abs(a) + jnp.abs(b), y, out)
-    assert switch.restitution_fn is not None
+    assert isinstance(switch, impact) and switch.restitution_fn is not None
     e = jnp.asarray(switch.restitution_fn(model.system), t.dtype)
     e = select(model.direction > 0, e, 1 / e)
     which = (k, *[j for j in model.contacts if j != k and k in model.contacts])
@@ -121,36 +122,94 @@ def completed(
     """Checks an impact, and sums the sequence of ever shorter flights that follows it up to its accumulation point.
 
     With the velocity h' after the impact, the acceleration h'' < 0 and the ratio r = -h'(t+)/h'(t-) < 1 the remaining
-    flights last 2 h' / (-h'') (1 + r + r² + ...).
+    flights last 2 h' / (-h'') (1 + r + r² + ...). For a surface that is crossed h is taken with the sign it has.
     """
-
-    def rate(t: Scalar, y: Y) -> Scalar:
-        return model.approach(k, t, y, state_after)
-
-    one, eps = jnp.ones_like(te), jnp.finfo(te.dtype).eps
+    eps = jnp.finfo(te.dtype).eps
     speed = model.approach(k, te, before, state)
-    rise = rate(te, after)
-    f = model.flow(te, after, state_after)
-    pull = jax.jvp(rate, (te, after), (one, f))[1]
-    (blur,) = model.rounding(lambda t, y: (jax.jvp(rate, (t, y), (one, model.flow(t, y, state_after)))[1],), te, after)
+    rate, state_after = _away(model, k, te, after, state_after)
+    if not isinstance(model.switches[k], impact):
+        speed = speed * state.mode[k].astype(te.dtype)
+    rise, pull, f = _departure(model, rate, te, after, state_after)
+    (blur,) = model.rounding(lambda t, y: (_departure(model, rate, t, y, state_after)[1],), te, after)
     h = jnp.stack(model.h(k, te, after))
     noise = model.rounding(lambda t, y: model.h(k, t, y), te, after)
     slack = 1e4 * noise + 2 * jnp.abs(jnp.stack(model.h(k, te, before)))
     part = 0 if state_after.part[k] is None else state_after.part[k]
     stays = jnp.abs(h[part]) <= slack[part]
     least = 64 * eps * jnp.abs(speed) + slow(model, k, te, after, state_after)
-    wrong = jnp.any(h < -slack) | (stays & (rise < -jnp.maximum(1e-9 * jnp.abs(speed), least)))
+    wrong = stays & (rise < -jnp.maximum(1e-9 * jnp.abs(speed), least))
+    if isinstance(model.switches[k], impact):
+        wrong = jnp.any(h < -slack) | wrong
     ratio = select(speed == 0, 0, -rise / select(speed == 0, 1, speed))
     rises = rise > least
     # Where the force is rounding too, rounding of dh/dt makes no flight.
     flight = 2 * (rise - select(rises, 0, lax.stop_gradient(rise))) / select(pull < 0, -pull, 1)
     held = stays & ~rises & (jnp.abs(pull) <= blur)  # without any force
     possible = stays & ~wrong & ((pull < 0) | held) & (ratio < 1)
-    rest = select(possible, flight / (1 - select(possible, ratio, 0)), 0)
-    drift = jax.tree.map(lambda x, f: x + rest * f, after, f)
     impulse = jax.tree.map(jnp.subtract, after, before)
-    left, gain = jax.jvp(lambda y: rate(te, y), (drift,), (impulse,))
-    scale = select(gain == 0, 0, left / select(gain == 0, 1, gain))
-    rested = jax.tree.map(lambda x, d: x - scale * d, drift, impulse)
+    switch = model.switches[k]
+    if isinstance(switch, ResettingSwitch) and switch.reset_fn is not None:
+        rest, rested = _rest_after_resets(model, k, te, after, impulse, state_after, possible & rises)
+    else:
+        rest = select(possible, flight / (1 - select(possible, ratio, 0)), 0)
+        drift = jax.tree.map(lambda x, f: x + rest * f, after, f)
+        left, gain = jax.jvp(lambda y: rate(te, y), (drift,), (impulse,))
+        scale = select(gain == 0, 0, left / select(gain == 0, 1, gain))
+        rested = jax.tree.map(lambda x, d: x - scale * d, drift, impulse)
     low = 0.25 * flight * rise <= 1e3 * noise[part]
     return Completed(rises, flight, rest, rested, possible, low, stays, wrong)
+
+
+def _away(
+    model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState
+) -> tuple[Callable[[Scalar, Y], Scalar], ModeState]:
+    """dh/dt as a function of time and state, counted positive away from the surface, and the mode of the flight that
+    begins at `t`, `y`. (From a surface that is crossed it leads to the side to which h moves.)"""
+    if isinstance(model.switches[k], impact):
+        return lambda t, y: model.approach(k, t, y, state), state
+    rate = frozen(model.approach(k, t, y, state))
+    side = select(rate == 0, state.mode[k], jnp.sign(rate).astype(jnp.int32))
+    state = state._replace(mode=put(state.mode, (k,), (side,)))
+    return lambda t, y: side.astype(t.dtype) * model.approach(k, t, y, state), state
+
+
+def _departure(
+    model: SwitchedSystem, rate: Callable[[Scalar, Y], Scalar], t: Scalar, y: Y, state: ModeState
+) -> tuple[Scalar, Scalar, Y]:
+    """dh/dt and d²h/dt² where a flight begins, and the field there."""
+    f = model.flow(t, y, state)
+    rise, pull = jax.jvp(rate, (t, y), (jnp.ones_like(t), f))
+    return rise, pull, f
+
+
+def _rest_after_resets(
+    model: SwitchedSystem, k: int, t: Scalar, y: Y, impulse: Y, state: ModeState, wanted: Bool[Array, ""]
+) -> tuple[Scalar, Y]:
+    """How long all flights together last that follow an event with a reset of the user's, and the state after them.
+
+    The next two flights are made: the two sides of a surface that is crossed may differ. What they change is repeated
+    in the ratio of the speeds before and after them. A component that the reset changes by as much each time (a
+    counter, a sign) has no limit: it keeps the value that it has, apart from its drift. `impulse`: what the reset has
+    just changed.
+    """
+    start, length, speeds = y, jnp.zeros_like(t), []
+    last = jax.tree.map(jnp.zeros_like, y)
+    for _ in range(2):
+        rate, state = _away(model, k, t, y, state)
+        rise, pull, f = _departure(model, rate, t, y, state)
+        flight = 2 * rise / select(pull < 0, -pull, 1)
+        landing = jax.tree.map(lambda x, f, flight=flight: x + flight * f, y, f)
+        y = rebound(model, k, t, landing, state)[0]
+        last = jax.tree.map(jnp.subtract, y, landing)
+        length = length + flight
+        speeds.append(rise)
+    rate, _ = _away(model, k, t, y, state)
+    ratio = rate(t, y) / select(wanted, speeds[0], 1)
+    again = 1 / (1 - select(wanted & (ratio < 1), ratio, 0))
+    rest = select(wanted, length * again, 0)
+
+    def limit(x: Array, moved: Array, first: Array, last: Array, f: Array) -> Array:
+        decays = jnp.abs(last - ratio * first) <= 0.5 * (1 - ratio) * jnp.abs(first)
+        return x + select(wanted, select(decays, (moved - x) * again, rest * f), 0)
+
+    return rest, jax.tree.map(limit, start, y, impulse, last, model.flow(t, start, state))

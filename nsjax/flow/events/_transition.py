@@ -77,7 +77,7 @@ def transition(
     news = jnp.zeros((), bool)
     for k, switch in enumerate(model.switches[: model.declared]):
         news = news | (state.mode[k] != step.state.mode[k])
-        if isinstance(switch, impact):
+        if switch.jumps:
             news = news | event.fired[k]
 
     slot, part = event.slot, event.part
@@ -186,15 +186,21 @@ class _Event:
         for k, switch in enumerate(model.switches):
             if isinstance(switch, (relay, clock)):
                 modes[k] = select(self.fired[k], switch.next_mode(modes[k], model.direction), modes[k])
-            elif isinstance(switch, impact):
-                touching = self.state._replace(part=tuple(self.parts))
+            if not switch.jumps:
+                continue
+            touching = self.state._replace(part=tuple(self.parts))
+            if not isinstance(switch, clock):
                 # Another impact at this instant may have opened it: then h < 0 is rounding.
-                opens = self.fired[k] & (model.approach(k, t, before, touching) > slow(model, k, t, before, touching))
+                rate = model.approach(k, t, before, touching)
+                if not isinstance(switch, impact):
+                    rate = self.state.mode[k].astype(t.dtype) * rate
+                opens = self.fired[k] & (rate > slow(model, k, t, before, touching))
                 self.roots[k] = select(opens, 1, self.roots[k])
-                self.fired[k] = now = self.fired[k] & ~opens
-                hit = rebound(model, k, t, before, touching)
-                now_and_then = hit, (self.after, self.size)
-                self.after, self.size = jax.tree.map(lambda a, b, now=now: select(now, a, b), *now_and_then)
+                self.fired[k] = self.fired[k] & ~opens
+            # A reset by a clock sees functions of time as they are after the tick.
+            hit = rebound(model.within(tuple(modes)) if k in model.clocks else model, k, t, before, touching)
+            now_and_then = hit, (self.after, self.size)
+            self.after, self.size = jax.tree.map(lambda a, b, now=self.fired[k]: select(now, a, b), *now_and_then)
 
     def is_contested(self) -> Bool[Array, ""]:
         """Whether an impact changes the speed at which another contact, met at the same instant, closes: which of the
@@ -221,7 +227,7 @@ class _Event:
         mode = select(tip, -1, self.modes[k])
         here = ((self.state.mode[k] == 0) | self.fired[k] | (self.halted & (roots[k] > 0))) & ~tip
         roots[k] = select(tip, 1, roots[k])
-        if model.of_kind(impact) or model.clocks:
+        if model.jumping or model.clocks:
             # An impact may carry the state across the surface, or off it, and a tick the surface across the state: the
             # switch follows at once.
             h0 = model.least(k, t, self.before)
@@ -266,7 +272,9 @@ class _Event:
         model, t, state, jumped = self.model, self.t, self.mode_state(), self.after
         eps = jnp.finfo(t.dtype).eps
         brief = jnp.maximum(jnp.sqrt(eps) * (t - self.begin), 1e4 * eps * jnp.abs(t))
-        for k in model.of_kind(impact):
+        for k in model.jumping:
+            if k in model.clocks:
+                continue
             fired = self.fired[k]
             end = completed(model, k, t, self.before, jumped, self.state, state)
             ends = fired & end.possible & ((end.flight <= brief) | end.low)
@@ -275,7 +283,8 @@ class _Event:
             )
             self.result = RESULTS.where(fired & end.wrong, RESULTS.wrong_reset, self.result)
             fresh = select(end.stays, select(end.rises, 1, 2), 0)
-            self.roots[k] = select(fired, fresh, self.roots[k]).astype(jnp.int32)
+            if isinstance(model.switches[k], impact):
+                self.roots[k] = select(fired, fresh, self.roots[k]).astype(jnp.int32)
             if k in model.contacts:
                 moved = self.set_in_motion(k, state, jumped, brief)
                 self.at[k] = ends | ((self.modes[k] == 1) & ~moved)
@@ -304,6 +313,8 @@ class _Event:
         # What cannot be held crosses when it fires, unless that is the residual of an event a few ulps earlier: dh/dt
         # tells.
         crosses = [now & ~(self.halted & (roots == 0)) for now, roots in zip(self.fired, self.state.roots)]
+        # After a reset only dh/dt tells: it may turn the state back.
+        crosses = [jnp.zeros_like(now) if s.jumps else now for now, s in zip(crosses, model.switches)]
         leaves = {
             k: self.bounds[k] if k in model.holdable else crosses[k].astype(jnp.int32) for k in range(len(crosses))
         }

@@ -173,7 +173,7 @@ class OrbitCurve(eqx.Module):
 
         def jump(t: Scalar, x: Array, mode: Array, part: Array, after: Array, slot: Array, ends: Array) -> tuple:
             out = (self.unravel(x), jnp.zeros_like(t))
-            if any(isinstance(switch, impact) for switch in model.switches):
+            if any(switch.jumps for switch in model.switches):
                 table = jnp.asarray([(s.switch, s.part) for s in model.slots], jnp.int32)
                 switch, wall = table[slot]
                 # Of several walls it is the one that is hit, which need not be the one that the segment has left.
