@@ -88,7 +88,7 @@ def _simulate(args: argparse.Namespace, job: Job, t0: float, search: bool) -> So
     else:
         sol = solve(job.system, t0, t1, start_of(job), mode=mode, saveat=DENSE, throw=False, **how)
     if sol.result == RESULTS.wrong_contact or sol.result == RESULTS.wrong_parameter:  # a mistake in the model
-        raise SolveError(explain(job.system, sol))
+        raise SolveError(explain(job.system, sol, t1))
     return sol
 
 

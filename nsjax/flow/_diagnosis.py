@@ -13,7 +13,7 @@ import numpy as np
 from .._numerics._select import select
 from .._numerics._text import components, counted, written
 from .._types import Y
-from ..system._checks import closing_contacts
+from ..system._checks import closing_contacts, forces_on_speeds
 from ..system._impact import impact
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
@@ -22,8 +22,8 @@ from ._results import RESULTS
 from ._solution import Solution
 
 
-def explain(system: Any, sol: Solution) -> str:
-    """Why a solution failed, in one line."""
+def explain(system: Any, sol: Solution, t1: Any) -> str:
+    """Why a solution that was to end at `t1` failed, in one line."""
     text, result = str(RESULTS[sol.result]), sol.result
     where = f"t = {float(sol.t1):.10g}, {written(sol.y1)}"
     if result == RESULTS.nonfinite_field:
@@ -38,13 +38,14 @@ def explain(system: Any, sol: Solution) -> str:
         )
         text = f"The steps became too small at {where}: {cause}."
     elif result == RESULTS.wrong_contact:
-        model = SwitchedSystem.forwards(system, sol.t1, sol.y1)
-        closes = closing_contacts(model.at(sol.t1), sol.t1, sol.y1)
-        name = next((model.switches[k].name for k, bad in closes.items() if bad), "name")
+        text = _wrong_contact(system, sol)
+    elif result == RESULTS.max_steps_reached:
+        text = f"{_steps_wanted(sol, float(t1))} (At {where}.)"
+    elif result == RESULTS.stuck_in_events and (name := _rests_unheld(system, sol)):
         text = (
-            f"`{type(system).__name__}.vector_field` must contain `s.{name}` with the sign with which a contact force "
-            f"s.{name} >= 0 opens the gap `{name}`, but it closes it. Change its sign, or that of what `{name}` "
-            "returns: it must be positive while the contact is open."
+            f"The solution comes to rest on the surface of `{type(system).__name__}.{name}` with h = dh/dt = 0, but "
+            f"`s.{name}` acts on d²h/dt² and not on dh/dt, so that this `sgn` cannot hold it there. Let h contain the "
+            f"rate (h = x + ε dx/dt), or replace the jump of the force by a stiff spring. (At {where}.)"
         )
     elif result == RESULTS.stuck_in_events:
         text = f"{text} (At {where}, where these fired: {_fired(sol)}.)"
@@ -59,6 +60,69 @@ def explain(system: Any, sol: Solution) -> str:
     else:
         text = f"{text} (At {where}.)"
     return " ".join(text.split())
+
+
+def _wrong_contact(system: Any, sol: Solution) -> str:
+    """Which contact force acts in the wrong direction, or on the wrong derivative of its gap."""
+    owner, model = type(system).__name__, SwitchedSystem.forwards(system, sol.t1, sol.y1).at(sol.t1)
+    for k, wrong in forces_on_speeds(model, sol.t1, sol.y1).items():
+        if wrong:
+            name = model.switches[k].name
+            return (
+                f"`{owner}.{name}` is an impact, the force of which acts on d²h/dt², but in `vector_field` `s.{name}` "
+                "acts on dh/dt. What keeps its own h from falling below zero by acting on dh/dt, such as an ideal "
+                "diode, is a `sgn` (see Common elements in the guide)."
+            )
+    closes = closing_contacts(model, sol.t1, sol.y1)
+    name = next((model.switches[k].name for k, bad in closes.items() if bad), "name")
+    return (
+        f"`{owner}.vector_field` must contain `s.{name}` with the sign with which a contact force s.{name} >= 0 opens "
+        f"the gap `{name}`, but it closes it. Change its sign, or that of what `{name}` returns: it must be positive "
+        "while the contact is open."
+    )
+
+
+def _steps_wanted(sol: Solution, t1: float) -> str:
+    """What to write where the steps did not suffice: how many it takes at the rate so far, if that is any number."""
+    most, begin, end = sol.stats["max_steps"], float(sol.t0), float(sol.t1)
+    part = (end - begin) / (t1 - begin)
+    text = f"The maximum number of solver steps, `max_steps={most}`, was reached after {100 * part:.2g} % of the time."
+    wanted = 1.5 * most / part if part > 0 else np.inf
+    if wanted > 1e6:
+        return (
+            f"{text} The field may be stiff (take `solver=diffrax.Kvaerno5()` or `nsjax.Exponential()`), or jump where "
+            "no switch or clock says so."
+        )
+    digits = 10 ** (len(str(int(wanted))) - 1)
+    return (
+        f"{text} Write `max_steps={digits * (int(wanted) // digits + 1)}`, or take a method with longer steps, such as "
+        "`solver=nsjax.Taylor()`, or larger tolerances."
+    )
+
+
+def _rests_unheld(system: Any, sol: Solution) -> str | None:
+    """A `sgn` that does not act on dh/dt, on whose surface the solution has come to rest with forces towards it on
+    both sides."""
+    model = SwitchedSystem.forwards(system, sol.t1, sol.y1).at(sol.t1)
+    t, y = sol.t1, sol.y1
+    for k, switch in enumerate(model.switches):
+        if switch.order != 1 or switch.jumps or k in model.holdable or model.parts[k] > 1:
+            continue
+        small = 1e-6 * (1 + max(abs(float(x)) for x in components(y).values()))
+        pulls = []
+        for side in (1, -1):
+            mode = tuple(jnp.asarray(side if j == k else m, jnp.int32) for j, m in enumerate(sol.mode1))
+            state = ModeState.of(mode, [jnp.zeros((), jnp.int32) if n > 1 else None for n in model.parts])
+
+            def rate(t: Any, y: Y, state: ModeState = state) -> Any:
+                return model.approach(k, t, y, state)
+
+            f = model.flow(t, y, state)
+            pulls.append(side * float(jax.jvp(rate, (t, y), (jnp.ones_like(t), f))[1]))
+            near = abs(float(model.least(k, t, y))) <= small and abs(float(rate(t, y))) <= small
+        if near and max(pulls) < 0:
+            return switch.name
+    return None
 
 
 def _fired(sol: Solution) -> str:

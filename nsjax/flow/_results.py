@@ -69,8 +69,8 @@ with warnings.catch_warnings():  # of another text for success, which diffrax pr
             "restitution lies between 0 and 1, the time between two ticks of a clock is positive."
         )
         wrong_contact = (
-            "A contact force `s.name` >= 0 must open its gap, but in `vector_field` it closes it. Change its sign "
-            "there."
+            "A contact force `s.name` >= 0 must open its gap by acting on d²h/dt², but in `vector_field` it closes it, "
+            "or acts on dh/dt. Change its sign there; what acts on dh/dt is a `sgn`."
         )
         clock_too_fast = (
             "A clock ticks so fast that time has too few digits to tell its ticks apart, or more than 2^30 of them "

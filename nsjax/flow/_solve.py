@@ -22,7 +22,7 @@ from .._numerics._text import known, suggesting
 from .._numerics._while_any import while_any
 from .._numerics._whole_loops import ask_for_whole_loops
 from .._types import Scalar, StateT, Y
-from ..system._checks import check_model, closing_contacts
+from ..system._checks import check_model, closing_contacts, forces_on_speeds
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, System
@@ -78,7 +78,7 @@ def _run(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> tu
 
 
 def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options) -> tuple[Solution, Any]:
-    direction = select(t1 >= t0, 1, -1).astype(t0.dtype)
+    direction = select(t1 < t0, -1, 1).astype(t0.dtype)  # forwards to an end that is NaN
     t0 = check_model(system, t0, y0, direction)
     start, stop = t0 * direction, t1 * direction
     model = SwitchedSystem(ticking(system.assembled(), t0, y0), direction, start, y0, smooth=True).at(start)
@@ -150,8 +150,8 @@ def _obstacle(flow: Flow, y: Y, f: Y, saveat: dfx.SaveAt, result: RESULTS) -> RE
         result = RESULTS.where(good, result, RESULTS.wrong_parameter)
     for t in (t0, t1) if model.clocks else ():
         result = RESULTS.where(model.countable(t * model.direction), result, RESULTS.clock_too_fast)
-    for closes in closing_contacts(model, t0, y).values():
-        result = RESULTS.where(closes, RESULTS.wrong_contact, result)
+    for wrong in (*closing_contacts(model, t0, y).values(), *forces_on_speeds(model, t0, y).values()):
+        result = RESULTS.where(wrong, RESULTS.wrong_contact, result)
     good = finite((y, f, t0, t1))
     result = RESULTS.where(good, result, RESULTS.nonfinite_field)
     if ts is not None and len(ts):
@@ -402,7 +402,7 @@ def solve(
     if not known(sol.result):  # numbers that are known, within a function that is being compiled
         return raise_if(~is_okay(sol.result), sol.result, sol)
     if not is_okay(sol.result):
-        raise SolveError(explain(system, sol))
+        raise SolveError(explain(system, sol, t1))
     return sol
 
 

@@ -148,7 +148,9 @@ def find_orbit(
         orbit = search.run(system, y0, period)
     if throw and known(orbit) and not is_okay(orbit.result):
         last = f"t = {float(orbit.t0):.6g}, {written(orbit.y0)}, period {float(orbit.period):.6g}"
-        raise SolveError(f"{RESULTS[orbit.result]} (The search ended at {last}.)")
+        why = search.failure(system, y0) if concrete and orbit.result == RESULTS.orbit_not_found else None
+        cause = f" The solution from the guess fails: {why}" if why else ""
+        raise SolveError(f"{RESULTS[orbit.result]} (The search ended at {last}.){cause}")
     return raise_if(~is_okay(orbit.result), orbit.result, orbit) if throw else orbit
 
 

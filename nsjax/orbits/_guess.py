@@ -63,6 +63,7 @@ def base_on(sol: Solution, t0: Scalar, y0: Y, period: Scalar, sign: float) -> tu
     # Of equally near returns the one nearest to the guess: a user who asks for two laps gets two.
     best = share[jnp.argmin(gap + 0.05 * jnp.abs(share - 1))]
     reached = is_okay(sol.result)
+    here = jax.tree.map(lambda a, b: select(reached, a, b), here, y0)
     return here, select(reached, best, 1) * period, of_relays(system, modes[longest])
 
 

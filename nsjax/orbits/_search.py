@@ -19,7 +19,7 @@ from ..flow._results import is_okay, RESULTS
 from ..system._system import System
 from ._guess import of_relays, undecided
 from ._orbit import Orbit
-from ._settle import held_throughout, repeats, repeats_held, settle_down, Settled, sticks_anywhere
+from ._settle import failure, held_throughout, repeats, repeats_held, settle_down, Settled, sticks_anywhere
 from ._shooting import Shooting
 from .segments._guess import cuts_from, cuts_near, Segment
 from .segments._solve import by_segments
@@ -63,7 +63,7 @@ class Search(NamedTuple):
         if system.period is None and period is None:
             return self._from_nothing(system, y0)
         if self.order is None and system.period is not None:
-            start, _, _, mode = self._settled(system, y0)
+            start, _, _, mode, _ = self._settled(system, y0)
             order = repeats(system, self.t0, start, self.sign, mode, self.integrator)
             return self._tries(system, start, jnp.ones_like(self.t0), order, mode)
         period = jnp.asarray(1.0 if period is None else period, self.t0.dtype)
@@ -76,7 +76,7 @@ class Search(NamedTuple):
                 return orbit
         orbit = self._tries(system, y0, period, order, self.mode)
         if self.concrete and not bool(is_okay(orbit.result) | (orbit.result == RESULTS.orbit_is_multiple_cover)):
-            start, period, rests, mode = self._settled(system, y0)
+            start, period, rests, mode, _ = self._settled(system, y0)
             if rests:
                 orbit = eqx.tree_at(lambda o: o.result, orbit, self._at_rest(system, start))
             if period > 0:
@@ -97,6 +97,10 @@ class Search(NamedTuple):
         for values in itertools.product((0, 1), repeat=len(names)) if 0 < len(names) <= MOST_RELAYS else ():
             yield given | {name: jnp.asarray(value, jnp.int32) for name, value in zip(names, values)}
 
+    def failure(self, system: System, y0: Y) -> str | None:
+        """Why the solution from the guess ends early, if it does."""
+        return failure(frozen(system), self.t0, lax.stop_gradient(y0), self.sign, self.mode, self.integrator)
+
     def _at_rest(self, system: System, y: Y) -> RESULTS:
         sticks = sticks_anywhere(frozen(system), self.t0, y)
         return RESULTS.where(sticks, RESULTS.orbit_sticks_for_ever, RESULTS.orbit_is_equilibrium)
@@ -107,12 +111,14 @@ class Search(NamedTuple):
 
     def _from_nothing(self, system: System, y0: Y) -> Orbit:
         """Of an autonomous system, without a guess of the period."""
-        start, period, rests, mode = self._settled(system, y0)
+        start, period, rests, mode, failed = self._settled(system, y0)
         lost = ~(period > 0)
-        orbit = self._tries(system, start, select(lost, 1, period), 1, mode)
+        # Where the solution itself fails, other formulations do so too.
+        search = self._replace(method="shooting") if self.concrete and self.method is None and bool(failed) else self
+        orbit = search._tries(system, start, select(lost, 1, period), 1, mode)
         at_rest = self._at_rest(system, start) if self.concrete else RESULTS.orbit_is_equilibrium
         end = RESULTS.where(rests, at_rest, RESULTS.orbit_not_found)
-        return eqx.tree_at(lambda o: o.result, orbit, RESULTS.where(lost, end, orbit.result))
+        return eqx.tree_at(lambda o: o.result, orbit, RESULTS.where(lost & ~is_okay(orbit.result), end, orbit.result))
 
     def _tries(self, system: System, y0: Y, period: Scalar, order: int, mode: Any) -> Orbit:
         """In the formulation asked for, or in one after the other until one finds it."""

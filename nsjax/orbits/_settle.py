@@ -19,6 +19,7 @@ from .._numerics._select import select
 from .._types import Scalar, Y
 from ..derivatives._flow_map import Directions, flow_map, with_room
 from ..derivatives._variational import arcs
+from ..flow._diagnosis import explain
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, RESULTS
 from ..flow._solution import Solution
@@ -37,13 +38,14 @@ SETTLED = 1e-13  # relative: a lap that moves the state by less changes nothing 
 
 
 class Settled(NamedTuple):
-    """Where a solution settles; the time in which it returns there (0 if it does not), whether it comes to rest, and
-    the modes of relays."""
+    """Where a solution settles; the time in which it returns there (0 if it does not), whether it comes to rest, the
+    modes of relays, and whether it failed on the way."""
 
     y: Y
     period: Scalar
     rests: Bool[Array, ""]
     mode: Relays
+    failed: Bool[Array, ""]
 
 
 def settle_down(
@@ -53,7 +55,8 @@ def settle_down(
     if system.period is not None:
         for sol in _laps(system, t0, y0, sign, mode, integrator, LAPS):
             y0, mode = sol.y1, of_relays(system, sol.mode1)
-        return Settled(y0, jnp.asarray(system.period, t0.dtype), jnp.zeros((), bool), mode)
+        no = jnp.zeros((), bool)
+        return Settled(y0, jnp.asarray(system.period, t0.dtype), no, mode, no)
     # How long it takes is measured in steps of the integration, which know the system's own scale of time. Only a guess
     # is wanted: a loose tolerance makes long steps, and so the solution is followed farther.
     loose, last = _loose(integrator, t0.dtype), None
@@ -70,6 +73,16 @@ def settle_down(
         steps, events = steps + int(last.stats["num_steps"]), events + int(last.events.num)
     loop = _followed(system, t0, t0 + sign * FAR, y0, mode, loose)
     return _returned(system, last, loop, t0, sign)
+
+
+def failure(system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrator: Integrator) -> str | None:
+    """Why the solution from a guess ends early, if it does, and where."""
+    if system.period is None:
+        end, integrator = t0 + sign * FAR, _loose(integrator, t0.dtype)
+    else:
+        end = t0 + sign * jnp.asarray(system.period, t0.dtype)
+    sol = _followed(system, t0, end, y0, mode, integrator)
+    return None if bool(_goes_on(sol) | is_okay(sol.result)) else explain(system, sol, end)
 
 
 def _goes_on(sol: Solution) -> Bool[Array, ""]:
@@ -100,6 +113,13 @@ def _returned(system: System, last: Solution, loop: Solution, t0: Scalar, sign: 
     times = sign * (starts[:, None] + (stops - starts)[:, None] * u).ravel()
     valid = jnp.repeat(jnp.arange(len(starts), dtype=steps.dtype) < steps, 8)
     states = jax.vmap(lambda t: ravel(loop.evaluate(t)))(select(valid, times, t0))
+    # A solution that has ended in an event returns to the state after it, between two of these points.
+    events = loop.events
+    times = jnp.concatenate([times, events.t])
+    states = jnp.concatenate([states, jax.vmap(ravel)(events.y_after)])
+    valid = jnp.concatenate([valid, jnp.arange(len(events.t), dtype=events.num.dtype) < events.num])
+    order = jnp.argsort(select(valid, sign * times, jnp.inf))
+    times, states, valid = times[order], states[order], valid[order]
     here = ravel(last.y1)
     scale = jnp.max(select(valid[:, None], jnp.abs(states - here), 0), axis=0)
     gap = jnp.max(jnp.abs(states - here) / select(scale == 0, 1, scale), axis=-1)
@@ -111,7 +131,8 @@ def _returned(system: System, last: Solution, loop: Solution, t0: Scalar, sign: 
     ended = (last.result == RESULTS.max_steps_reached) | (last.result == RESULTS.successful)
     rests = ended & (jnp.max(scale) <= 1e-4 * (1 + jnp.max(jnp.abs(here))))
     period = select(rests, 0, sign * (times[jnp.argmax(low)] - t0))
-    return Settled(last.y1, period, rests, of_relays(system, last.mode1))
+    failed = ~(_goes_on(last) | is_okay(last.result))
+    return Settled(last.y1, period, rests, of_relays(system, last.mode1), failed)
 
 
 def _laps(

@@ -156,7 +156,10 @@ def _search(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Scala
         base = look(_unknowns(y0, period, True), LAPS, unsure).base
     z, converged = _unknowns(*base[:2], system.period is None), unsure
     for _ in range(shooting.newton.max_steps):
-        z, ended, converged = look(z, shooting.part, unsure).step
+        new, ended, converged = look(z, shooting.part, unsure).step
+        if not np.all(np.isfinite(new)):  # there is no solution from the unknowns; they are what is reported
+            break
+        z = new
         if ended:
             break
     orbit = look(z, 1.0, converged).orbit

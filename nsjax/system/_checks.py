@@ -16,7 +16,8 @@ from .._numerics._select import select
 from .._numerics._text import did_you_mean
 from .._types import Scalar, Y
 from ._clock import clock
-from ._mode import ModeState
+from ._impact import impact
+from ._mode import ModeState, put
 from ._model import SwitchedSystem
 from ._switch import AbstractSwitch
 from ._system import is_number, System
@@ -199,6 +200,24 @@ def _changes(system: System, t: Scalar, y: Y) -> Array:
         change = jnp.max(select(known, change, 0), initial=0.0)
         found.append(change / select(size > 0, size, 1))
     return jnp.stack(found)
+
+
+def forces_on_speeds(model: SwitchedSystem, t: Scalar, y: Y) -> dict[int, Bool[Array, ""]]:
+    """Of each impact with a coefficient of restitution that cannot be rested upon, whether its contact force acts on
+    dh/dt: then there is no impulse that changes dh/dt by a finite amount."""
+    zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
+    found = {}
+    for k in model.of_kind(impact):
+        if k in model.contacts or getattr(model.switches[k], "reset_fn", None) is not None:
+            continue
+
+        def rates(value: Scalar, k: int = k) -> tuple[Scalar, ...]:
+            f = model.field(t, y, put(zeros, (k,), (value,)))
+            return jax.jvp(lambda t, y: model.h(k, t, y), (t, y), (jnp.ones_like(t), f))[1]
+
+        gains = jax.jvp(rates, (zeros[k],), (jnp.ones_like(t),))[1]
+        found[k] = jnp.any(jnp.stack([gain != 0 for gain in gains]))
+    return found
 
 
 def closing_contacts(model: SwitchedSystem, t: Scalar, y: Y) -> dict[int, Bool[Array, ""]]:

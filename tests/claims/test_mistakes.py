@@ -175,6 +175,32 @@ class Level(nsjax.System):
         return jnp.where(self.jumps > 0, y.x - jnp.round(3 * y.x + 0.01), jnp.log(y.x) + 50)
 
 
+class Diode(nsjax.System):
+    """A current that is to be kept at zero by an impact, the force of which acts on its rate."""
+
+    def vector_field(self, t, y, s):
+        return Number(-1.0 + s.blocks)
+
+    @nsjax.impact
+    def blocks(self, t, y):
+        return y.x
+
+    @blocks.restitution
+    def blocks(self):
+        return 0.0
+
+
+class Spring(nsjax.System):
+    """A force of constant size towards x = 0, which holds a mass at rest there."""
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -s.middle - 0.5 * y.v)
+
+    @nsjax.sgn
+    def middle(self, t, y):
+        return y.x
+
+
 # Found while it is solved: the place is named.
 FEW = dict(max_steps=200, max_events=2)
 ON_THE_WAY = {
@@ -199,7 +225,22 @@ ON_THE_WAY = {
         lambda: run(mode={"belt": 0}),
         "`y0` lies clearly on the other. .At t = 0, x = 1, v = 0",
     ),
-    "too few steps": (lambda: run(belt(k=1e4, v_dr=1e3), t1=40.0, **FEW), "increasing `max_steps`. .At t = "),
+    "too few steps": (
+        lambda: run(belt(k=1e4, v_dr=1e3), t1=40.0, **FEW),
+        "reached after .* % of the time. Write `max_steps=[0-9]+000`, .*At t = ",
+    ),
+    "no step gets anywhere": (
+        lambda: run(Power(p=2.0), t1=2.0, y0=Number(1.0), max_steps=3),
+        "reached after [0-9.e-]+ % of the time",
+    ),
+    "a diode as an impact": (
+        lambda: run(Diode(), t1=2.0, y0=Number(0.5)),
+        "`Diode.blocks` is an impact.* acts on dh/dt.*such as an ideal diode, is a `sgn`",
+    ),
+    "a sign of a position at rest": (
+        lambda: run(Spring(), t1=2.0, y0=Motion(0.0, 0.0)),
+        "comes to rest on the surface of `Spring.middle` with h = dh/dt = 0, but `s.middle` acts on d²h/dt²",
+    ),
     "too few events": (lambda: run(t1=90.0, y0=Motion(2.5, 0.0), **FEW), "Increase `max_events`.*At t = 15.7"),
 }
 
