@@ -493,3 +493,30 @@ def test_friction_of_an_open_contact(mu):
     np.testing.assert_allclose([landing.t, landing.y_after.u], [1.0, v], atol=1e-12)
     end = [v + 2 * pull, 2 * v + 2 * pull]
     np.testing.assert_allclose([sol.y1.u, sol.y1.x - landing.y_after.x], end, atol=1e-9)
+
+
+@pytest.mark.parametrize("drift", [1e-20, 3e-16, -3e-16])
+def test_a_start_that_is_told_to_rest_may_have_drifted(drift):
+    """Where h is a state itself, a number next to zero has no rounding to be compared with."""
+    rest = solve(Ball(), 0.0, 1.0, Motion(drift, 0.0), mode={"floor": 1})
+    np.testing.assert_allclose(rest.y1, 0.0, atol=1e-15)
+    for far in (1e-3, -1e-3):
+        assert solve(Ball(), 0.0, 1.0, Motion(far, 0.0), mode={"floor": 1}, throw=False).result in (
+            RESULTS.wrong_mode,
+            RESULTS.start_penetrates,
+        )
+
+
+@pytest.mark.parametrize("drift", [1e-20, 3e-16, -3e-16])
+def test_a_start_that_is_told_to_slide_may_have_drifted(drift):
+    class Held(nsjax.System):
+        def vector_field(self, t, y, s):
+            return Motion(0.5 - s.line, jnp.ones_like(t))
+
+        @nsjax.sgn
+        def line(self, t, y):
+            return y.x
+
+    np.testing.assert_allclose(solve(Held(), 0.0, 1.0, Motion(drift, 0.0), mode={"line": 0}).y1, [0.0, 1.0], atol=1e-15)
+    far = solve(Held(), 0.0, 1.0, Motion(1e-3, 0.0), mode={"line": 0}, throw=False)
+    assert far.result == RESULTS.wrong_mode

@@ -9,7 +9,7 @@ import numpy as np
 from ...maps._corner_normal_form import Cycle
 from ...orbits.segments._corrector import Plane
 from ...orbits.segments._equations import linearised, OrbitCurve
-from ...orbits.segments._itinerary import capacity_for, OrbitItinerary, Start, TIME
+from ...orbits.segments._itinerary import capacity_for, OrbitItinerary, Start, ticks, TIME
 from ...orbits.segments._point import correct, state_at
 from ...system._mode import mode_words
 from .._tracer import Zero
@@ -103,11 +103,13 @@ def admissible(curve: OrbitCurve, spot: OrbitPoint) -> bool:
     return all(v > -1e-9 for t, v in test_values(curve, spot, scale).items() if t.kind in CORNERS)
 
 
-def _repeated(spot: OrbitPoint, times: int, period: float) -> tuple[OrbitItinerary, Start]:
+def _repeated(curve: OrbitCurve, spot: OrbitPoint, times: int, period: float) -> tuple[OrbitItinerary, Start]:
     """The orbit several times."""
     n = int(spot.itinerary.num)
     rows = list(range(n)) * times
     itinerary = spot.itinerary.take(rows, capacity_for(len(rows)))
+    lap = np.minimum(np.arange(len(itinerary.mode)) // n, times - 1).astype(np.int32)
+    itinerary = itinerary._replace(mode=itinerary.mode + lap[:, None] * ticks(curve.model, spot.itinerary))
     shift = np.repeat(np.arange(times) * period, n)
     look = spot.look
     first = (np.tile(look.begin[:n], times) + shift, np.tile(look.end[:n], times) + shift)
@@ -120,7 +122,7 @@ def _repeated(spot: OrbitPoint, times: int, period: float) -> tuple[OrbitItinera
 def flip_at(tracer: OrbitTracer, name: str, spot: OrbitPoint) -> Node | None:
     """Where a multiplier is -1: the orbit twice is a branch point of orbits of twice the period."""
     curve = tracer.curve
-    itinerary, start = _repeated(spot, 2, float(spot.look.period))
+    itinerary, start = _repeated(curve, spot, 2, float(spot.look.period))
     twice = tracer_for(tracer, with_order(curve, 2 * int(curve.order)))
     u = twice.curve.pack(start, spot.parameter)
     kernel = _kernel(twice, itinerary, u)

@@ -92,8 +92,7 @@ class _Start:
                     f"minimum, or `s.{name}` is not a force that acts on d²h/dt²)."
                 )
             self.at[k], rests = rests, jnp.asarray(self.given[name]) == 1
-            self.result = RESULTS.where(rests & (h > 1e6 * noise), RESULTS.wrong_mode, self.result)
-            self.beyond[k] = -h - 1e6 * noise
+            self.beyond[k] = select(rests, jnp.abs(h), -h) - 1e6 * noise
             self.on[k] = h <= noise
         else:
             self.result = RESULTS.where(h < -noise, RESULTS.start_penetrates, self.result)
@@ -141,12 +140,33 @@ class _Start:
             # Near the origin h has no rounding of its own, but a state that an earlier event left there has that of the
             # event's time. So the measure is how soon the surface is crossed, not how large h is.
             soon = AT_ONCE * float(jnp.finfo(t.dtype).eps) ** 0.5 * self.horizon
-            off = gap > soon * jnp.abs(frozen(model.approach(k, t, y, state, f)))
+            off = gap > soon * self.speed(k, state, f)
             if model.conditional(k):
                 off = off & ~model.absent(k, state.mode)
-            contact = isinstance(model.switches[k], impact)
-            failure = RESULTS.start_penetrates if contact else RESULTS.wrong_mode
-            self.result = RESULTS.where(off, failure, self.result)
+            self.result = RESULTS.where(off, RESULTS.wrong_mode, self.result)
+            if isinstance(model.switches[k], impact):
+                below = off & (model.least(k, t, y) < 0)
+                self.result = RESULTS.where(below, RESULTS.start_penetrates, self.result)
+
+    def speed(self, k: int, state: ModeState, f: Y | None) -> Scalar:
+        """How fast h of switch k changes; where it is held, how fast it would change beside its surface."""
+        model, t, y = frozen((self.model, self.t, self.y))
+        rate = jnp.abs(frozen(model.approach(k, t, y, state, f)))
+        if k not in model.holdable:
+            return rate
+
+        def beside(mode: int) -> ModeState:
+            return state._replace(
+                mode=tuple(jnp.asarray(mode if j == k else m, jnp.int32) for j, m in enumerate(state.mode))
+            )
+
+        if k in model.contacts:  # it would fall for all the time
+            free = beside(0)
+            (pull,) = model.rates((k,), t, y, free, model.values(t, y, free))
+            fast = self.horizon * jnp.abs(pull)
+        else:
+            fast = jnp.maximum(*(jnp.abs(model.approach(k, t, y, beside(side))) for side in (1, -1)))
+        return select(model.held(k, state.mode[k]), jnp.maximum(rate, fast), rate)
 
     def roots_there(self, state: ModeState, values: tuple[Any, ...], f: Y) -> list[Any]:
         """Guards of surfaces on which the start lies have a root there already. `values` of the switches and field `f`

@@ -56,11 +56,16 @@ class OrbitCurve(eqx.Module):
     exact: int = eqx.field(static=True)  # which flows are known by their exponentials
     slides: bool = eqx.field(static=True, default=True)  # whether surfaces hold segments of the itinerary
     pieces: int = eqx.field(static=True, default=1)
+    held: bool = eqx.field(static=True, default=False)  # whether surfaces hold an orbit throughout
 
     def on(self, itinerary: OrbitItinerary) -> "OrbitCurve":
         """With flows as the modes of an itinerary allow."""
-        slides = self.model.holds(*np.asarray(itinerary.mode)[: int(itinerary.num)])
-        return self if slides == self.slides else dataclasses.replace(self, slides=slides)
+        n = int(itinerary.num)
+        slides = self.model.holds(*np.asarray(itinerary.mode)[:n])
+        held = slides and not np.isin(np.asarray(itinerary.ends)[:n], (EVENT, REPELLING_EXIT)).any()
+        return (
+            self if (slides, held) == (self.slides, self.held) else dataclasses.replace(self, slides=slides, held=held)
+        )
 
     @property
     def value(self) -> Array:
@@ -182,6 +187,10 @@ class OrbitCurve(eqx.Module):
                 k = select(ends == EVENT, switch, -1)
                 state = self.state(mode, select(hits, wall, part))
                 out = landing(model, k, t, self.unravel(x), state, tuple(after))
+            if self.held:  # off the surface the flow goes on beside it, so that any distance would repeat itself
+                state = self.state(mode, part)
+                onto = model.project(t, out[0], state)
+                out = jax.tree.map(lambda a, b: select(ends == PIECE, b, a), onto, out[0]), out[1]
             return jfu.ravel_pytree(out[0])[0], out[1]
 
         after, rest = jax.vmap(jump)(end, last, mode, part, following, itinerary.slot, itinerary.ends)

@@ -88,6 +88,15 @@ def slot_of(model: SwitchedSystem, k: int, holding: bool, part: int) -> int:
     return next(i for i, s in enumerate(model.slots) if (s.switch, s.holding, s.part) == (k, holding, part))
 
 
+def ticks(model: SwitchedSystem, itinerary: OrbitItinerary) -> Int[np.ndarray, " switches"]:
+    """By how much each clock has gone on after one passage through an orbit; 0 for other switches."""
+    count = np.zeros(len(model.switches), np.int32)
+    for i in itinerary.rows:
+        if itinerary.ends[i] == EVENT and (k := model.slots[int(itinerary.slot[i])].switch) in model.clocks:
+            count[k] += 1
+    return count
+
+
 def returning(model: SwitchedSystem, itinerary: OrbitItinerary) -> list[int]:
     """The segments that leave a surface and end on it again. Each of them may stay there for no time at all, which
     solves the equations too: where its duration vanishes the curve crosses that of such orbits, which are none."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from ....maps._corner_normal_form import CornerMap, Cycle
 from ....orbits.segments._equations import OrbitCurve
-from ....orbits.segments._itinerary import EventRecord, same_itinerary, Start, starts_from
+from ....orbits.segments._itinerary import EventRecord, same_itinerary, Start, starts_from, ticks
 from ..._tracer import Trace
 from .._branch_switching import admissible, Departure, together, tracer_for, with_order
 from .._tracer import OrbitPoint, OrbitTracer
@@ -103,10 +103,11 @@ def _predicted(curve: OrbitCurve, spot: OrbitPoint, points: list[Base], cycle: C
         return None
     here, there = (curve.model_at(jnp.asarray(v)).system for v in (spot.parameter, value))
     slow = 1.0 if curve.autonomous else float(there.period) / float(here.period)
-    diaries = []
+    diaries, gone_on = [], ticks(curve.model, spot.itinerary)
     for lane in range(count):
         diary = EventRecord.of(jax.tree.map(lambda leaf: leaf[lane], events))
-        diaries.append(diary._replace(t=diary.t + (lane // m) * period * slow))
+        before, after = (modes + (lane // m) * gone_on for modes in diary.modes)
+        diaries.append(diary._replace(t=diary.t + (lane // m) * period * slow, modes=(before, after)))
     at = begin[0] * slow, cycle.laps * period * slow, modes[0], x[0]
     diary = functools.reduce(EventRecord.joined, diaries)
     if curve.autonomous and len(diary.t):  # time counts from the first event, as on the curve
