@@ -19,6 +19,7 @@ from ...flow._mode_flow import ModeFlow
 from ...flow._results import is_okay
 from ...flow._solution import Solution
 from ...flow._solve import integrate
+from ...system._clock import clock
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ...system._system import System
@@ -115,7 +116,9 @@ def _itinerary(
 def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, integrator: Integrator) -> SegmentGuess:
     """The segments that a user wrote down, each followed in its mode for as long as was said."""
     names = [k.name for k in system.switches]
-    modes = [_mode(names, s.mode) for s in segments]
+    ticking = [k for k, switch in enumerate(system.switches) if isinstance(switch, clock)]
+    # What a clock has counted follows from the time and its ticks.
+    modes = [tuple(0 if k in ticking else m for k, m in enumerate(_mode(names, s.mode, ticking))) for s in segments]
     if not segments:
         raise ValueError("Argument `segments` must have at least one segment.")
     if modes[0] != modes[-1]:
@@ -137,6 +140,9 @@ def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, in
         if segment.free and not (slides and modes[i][switch[i]] == 0):
             raise ValueError(f"Argument `segments` has `free=True` in segment {i}, which must slide on what it leaves.")
     mode = jnp.asarray(modes, jnp.int32)
+    for k, count in model.counts(t0).items():
+        passed = np.cumsum([0, *(which == k for which in switch)])
+        mode = mode.at[:, k].set(count + passed.astype(np.int32))
     switch = jnp.asarray([*switch, -1], jnp.int32)
     durations = jnp.asarray([s.duration for s in segments], t0.dtype)
 
@@ -158,8 +164,9 @@ def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, in
     return SegmentGuess(begin, end, y, itinerary, free)
 
 
-def _mode(names: list[str], mode: Any) -> tuple[int, ...]:
+def _mode(names: list[str], mode: Any, ticking: list[int]) -> tuple[int, ...]:
     if isinstance(mode, Mapping):
+        mode = {names[k]: 0 for k in ticking} | dict(mode)
         if set(mode) != set(names):
             raise ValueError(f"The mode of a segment must name each of the switches {names}, but got {dict(mode)}.")
         return tuple(int(mode[n]) for n in names)
