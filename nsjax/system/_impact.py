@@ -68,7 +68,12 @@ class impact(ResettingSwitch):
     def guard_row(self, model: "SwitchedSystem", slot: Slot, t: Scalar, y: Y, state: ModeState) -> list[Scalar]:
         k = slot.switch
         gap = model.h(k, t, y)[slot.part]
-        return [select(state.mode[k] == 1, jnp.ones((), t.dtype), gap) if k in model.contacts else gap]
+        if k not in model.contacts:
+            return [gap]
+        closed = state.mode[k] == 1
+        for friction in [model.holdable[j] for i, j in model.normal if model.holdable[i] == k]:
+            closed = closed | model.gap_is_held(k, friction, t, y, state)
+        return [select(closed, jnp.ones((), t.dtype), gap)]
 
     def bound_guard(self, model: "SwitchedSystem", slot: Slot, value: Scalar, state: ModeState) -> Scalar:
         return value

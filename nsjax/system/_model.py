@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._numerics._autodiff import frozen
 from .._numerics._jaxpr import dependence, is_affine, is_constant
 from .._numerics._select import select
 from .._types import Mode, Scalar, Y
@@ -46,6 +47,7 @@ class SwitchedSystem(Clocked):
     jointly_affine: bool = eqx.field(static=True)  # whether the field is so in the values of all of them
     steady: bool = eqx.field(static=True)  # whether what acts on a surface that can be slid on is constant
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # of `holdable`: whose surfaces may coincide
+    normal: tuple[tuple[int, int], ...] = eqx.field(static=True)  # a contact, and friction that may be along its normal
     coupling: Coupling = eqx.field(static=True)  # of `holdable`: which values act on which surfaces
     apart: tuple[bool, ...] = eqx.field(static=True)  # which have nothing to do with the mode of any other
     contact: tuple[int, ...] = eqx.field(static=True)  # of each the switch while whose contact is closed it is there
@@ -78,8 +80,8 @@ class SwitchedSystem(Clocked):
         for k, row in zip(hard, self._reach(hard, second, zeros)):
             if row[k]:  # a force that acts on the gap of its own contact
                 reach[k] = row
-        slides = [n == 1 and not switch.jumps for n, switch in zip(order, self.switches)]
-        may = [(slides[k] or k in hard) and k not in crossed for k in range(len(order))]
+        signs = [n == 1 and not switch.jumps for n, switch in zip(order, self.switches)]
+        may = [(signs[k] or k in hard) and k not in crossed for k in range(len(order))]
         self.holdable = tuple(k for k in range(len(order)) if may[k] and reach[k, k])
         self.contacts = tuple(k for k in self.holdable if order[k] == 2)
         self.holding = tuple(self.switches[k].holding for k in self.holdable)
@@ -112,6 +114,16 @@ class SwitchedSystem(Clocked):
                 for j in range(len(dry))
                 for i in range(j)
                 if (seen[i] & seen[j]).any()
+            )
+        self.normal = ()
+        if dry and self.contacts:
+            opens = {c: dependence(lambda y, c=c: rates([c], t, y, zeros), y).any(0) for c in self.contacts}
+            slides = {k: dependence(lambda y, k=k: self.h(k, t, y), y).any(0) for k in dry}
+            self.normal = tuple(
+                (self.holdable.index(c), self.holdable.index(k))
+                for c in self.contacts
+                for k in dry
+                if (opens[c] & slides[k]).any()
             )
         # Whether the mode of another one has to do with it: of those whose mode is chosen at an event.
         free = np.array([(k in self.contacts or n == 1) and k not in crossed for k, n in enumerate(order)], bool)
@@ -211,6 +223,24 @@ class SwitchedSystem(Clocked):
         """Whether one of its switches does; in any of some modes that are known."""
         switches, holding = list(self.holdable), np.array(self.holding, int)
         return bool(np.any(np.stack(modes)[:, switches] == holding))
+
+    def gap_is_held(self, contact: int, friction: int, t: Scalar, y: Y, state: ModeState) -> Bool[Array, ""]:
+        """Whether friction along the normal of a contact sticks and so keeps its gap as it is: the rate of the gap is a
+        multiple of the sliding velocity. (What is left of a gap of zero would be rounding.)"""
+        model, t, y = frozen((self._in(state), t, y))
+
+        def both(t: Scalar, y: Y) -> tuple[Scalar, Scalar]:
+            return model.level(contact, t, y, state), model.level(friction, t, y, state)
+
+        zeros = tuple(jnp.zeros((), t.dtype) for _ in model.switches)
+        unit = put(zeros, (friction,), (jnp.ones((), t.dtype),))
+        push = jax.jvp(lambda *s: model.field(t, y, s), zeros, unit)[1]
+        opening, sliding = both(t, y)
+        by_force = jax.jvp(lambda y: both(t, y), (y,), (push,))[1]
+        ratio = by_force[0] / select(by_force[1] == 0, 1, by_force[1])
+        multiple = ratio * sliding
+        same = jnp.abs(opening - multiple) <= 1e-6 * (jnp.abs(opening) + jnp.abs(multiple))
+        return model.held(friction, state.mode[friction]) & same
 
     def level(self, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
         """What its multiplier keeps at zero: the active component of h; for a contact dh/dt, on which forces act."""

@@ -83,6 +83,12 @@ def _of_blocks(model: "SwitchedSystem", group: tuple[Block, ...], slope: list[An
         matrix[j] = jax.tree.map(lambda a, b, same=same: select(same, a, b), share, matrix[j])
         one_of = row([same if n == j else jnp.zeros_like(same) for n in range(m)])
         right = jax.tree.map(lambda r, gone: select(gone, 0, r), right, one_of)
+    for i, j in [(which.index(i), which.index(j)) for i, j in model.normal if len(group) == 1 and i in which]:
+        # Friction along the normal of a contact that rests: the contact alone holds, as their shares are open.
+        same = held[i] & held[j] & parallel(rows[i], rows[j])
+        matrix[j] = jax.tree.map(lambda a, b, same=same: select(same, a, b), units[j], matrix[j])
+        one_of = row([same if n == j else jnp.zeros_like(same) for n in range(m)])
+        right = jax.tree.map(lambda r, gone: select(gone, 0, r), right, one_of)
     return solve_rows(matrix, right)
 
 

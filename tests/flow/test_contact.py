@@ -520,3 +520,76 @@ def test_a_start_that_is_told_to_slide_may_have_drifted(drift):
     np.testing.assert_allclose(solve(Held(), 0.0, 1.0, Motion(drift, 0.0), mode={"line": 0}).y1, [0.0, 1.0], atol=1e-15)
     far = solve(Held(), 0.0, 1.0, Motion(1e-3, 0.0), mode={"line": 0}, throw=False)
     assert far.result == RESULTS.wrong_mode
+
+
+class Pressed(nsjax.System):
+    """A mass with dry friction, which F sin t presses onto a plastic stop at x = 1 and draws off it again."""
+
+    F: float = 3.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, self.F * jnp.sin(t) - s.ground - s.stop)
+
+    @nsjax.sgn
+    def ground(self, t, y):
+        return y.v
+
+    @nsjax.impact
+    def stop(self, t, y):
+        return 1.0 - y.x
+
+    @stop.restitution
+    def stop(self):
+        return 0.0
+
+
+def released(F):
+    """x(4) of the mass that friction holds at the stop until F |sin t| = 1, with x'' = F sin t + 1 from there on."""
+    begin = jnp.pi + jnp.arcsin(1 / F)
+    since = 4.0 - begin
+    return 1 - F * (jnp.sin(4.0) - jnp.sin(begin)) + F * jnp.cos(begin) * since + since**2 / 2
+
+
+@pytest.mark.parametrize("solver", [None, nsjax.Taylor()])
+def test_friction_along_the_normal_of_a_contact(solver):
+    """Issue 59.B4: the contact bears the load while it rests, and friction holds the mass when it has opened."""
+
+    def end(F):
+        return solve(Pressed(F), 0.0, 4.0, Motion(1.0, 0.0), solver=solver, rtol=1e-10, atol=1e-10)
+
+    sol = end(3.0)
+    np.testing.assert_allclose(sol.events.t[: int(sol.events.num)], [np.pi, np.pi + np.arcsin(1 / 3)], rtol=1e-9)
+    np.testing.assert_allclose(sol.y1.x, 0.938126445, rtol=1e-9)
+    np.testing.assert_allclose(jax.jacfwd(lambda F: end(F).y1.x)(3.0), jax.grad(released)(3.0), rtol=1e-7)
+    swept = nsjax.sweep(lambda F: end(F).y1.x, jnp.asarray([2.0, 3.0]))
+    np.testing.assert_allclose(swept, jax.vmap(released)(jnp.asarray([2.0, 3.0])), rtol=1e-8)
+    thrown = solve(Pressed(), 0.0, 4.0, Motion(0.9, 0.8), solver=solver, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(thrown.y1.x, sol.y1.x, rtol=1e-9)
+
+
+def test_friction_beside_a_stop_on_a_moving_belt():
+    """Friction that sticks to a belt does not keep the gap to a fixed stop as it is."""
+
+    class Carried(Pressed):
+        def vector_field(self, t, y, s):
+            return Motion(y.v, -5.0 * s.ground - s.stop)
+
+        @nsjax.sgn
+        def ground(self, t, y):
+            return y.v - 0.5
+
+    sol = solve(Carried(), 0.0, 4.0, Motion(0.0, 0.5))
+    np.testing.assert_allclose(sol.events.t[0], 2.0, rtol=1e-7)  # it comes to the stop, and rests there
+    np.testing.assert_allclose(sol.y1, [1.0, 0.0], atol=1e-9)
+
+
+def test_friction_that_is_overcome_towards_its_stop():
+    """Drawn off by less than friction holds, and pressed on again: the mass stays at the stop."""
+
+    class Swayed(Pressed):
+        def vector_field(self, t, y, s):
+            return Motion(y.v, 1.2 + self.F * jnp.sin(t) - s.ground - s.stop)
+
+    sol = solve(Swayed(2.0), 0.0, 20.0, Motion(1.0, 0.0))
+    np.testing.assert_allclose(sol.y1, [1.0, 0.0], atol=1e-12)
+    assert int(sol.stats["num_steps"]) < 500

@@ -325,7 +325,21 @@ class _Event:
             forked = forked | (entered & (model.direction < 0))
         wrong = wrong & (self.result == RESULTS.successful)
         self.result = RESULTS.where(wrong, RESULTS.ambiguous_event, self.result)
-        return state, forked
+        return self.released(state), forked
+
+    def released(self, state: ModeState) -> ModeState:
+        """Where friction lets go that has kept a gap of zero, h and its first two derivatives vanish."""
+        later, t, y, roots = self.later, self.t_after, self.after, list(state.roots)
+        for i, j in later.normal:
+            k, friction = later.holdable[i], later.holdable[j]
+            h, noise = later.least(k, t, y), jnp.max(later.rounding(lambda t, y, k=k: later.h(k, t, y), t, y))
+            # Beside zero h has no rounding of its own: what it has is that of the way which forces make in the time.
+            (rate,) = later.rates((k,), t, y, state, later.signs(t, state))
+            drift = float(jnp.finfo(t.dtype).eps) * (t - self.begin) ** 2 * jnp.abs(rate)
+            left = self.model.held(friction, self.state.mode[friction]) & ~later.held(friction, state.mode[friction])
+            left = left & (state.mode[k] == 0) & (jnp.abs(h) <= 1e4 * (noise + drift))
+            roots[k] = select(left, 3, roots[k]).astype(jnp.int32)
+        return state._replace(roots=tuple(roots))
 
     def relays_on_their_surfaces(self, state: ModeState, after: Y) -> ModeState:
         """The new surface of a relay may be the one just crossed (no hysteresis): then its root here is known."""
