@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from .. import gallery
 from .._numerics._text import components, nearest
 from .._types import Y
+from ..system._checks import check_parameters
 from ..system._system import System
 
 
@@ -99,11 +100,16 @@ def load(name: str, parameters: Mapping[str, str], y0: str | None) -> Job:
     - `parameters`: values in words, by name.
     - `y0`: `"x=1,v=0"`, or `"1,0"`; `None` for the default.
 
-    **Raises:** `UsageError`, naming what is possible.
+    **Raises:** `UsageError`, naming what is possible; `ValueError` for a value that the model forbids.
     """
     parts = _file_and_name(name)
-    if parts is not None:
-        return _load_file(*parts, parameters, y0)
+    job = _load_entry(name, parameters, y0) if parts is None else _load_file(*parts, parameters, y0)
+    check_parameters(job.system)
+    return job
+
+
+def _load_entry(name: str, parameters: Mapping[str, str], y0: str | None) -> Job:
+    """A system of the gallery."""
     try:
         entry = gallery.entry(name)
     except ValueError:

@@ -43,6 +43,20 @@ def known(tree: Any) -> bool:
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
 
 
+def outline(tree: Any) -> str:
+    """The structure of a pytree in words: `State(x, v)`, `{'x': *, 'v': *}`, `(*, [*, *])`; a leaf is `*`."""
+    if isinstance(tree, dict):
+        return "{" + ", ".join(f"{key!r}: {outline(value)}" for key, value in tree.items()) + "}"
+    fields = getattr(tree, "_fields", None) or tuple(getattr(tree, "__dataclass_fields__", ()))
+    if fields and not isinstance(tree, jax.ShapeDtypeStruct):
+        parts = {name: outline(getattr(tree, name)) for name in fields}
+        return f"{type(tree).__name__}({', '.join(n if text == '*' else f'{n}={text}' for n, text in parts.items())})"
+    if isinstance(tree, (tuple, list)):
+        inner = ", ".join(map(outline, tree))
+        return f"[{inner}]" if isinstance(tree, list) else f"({inner}{',' * (len(tree) == 1)})"
+    return "None" if tree is None else "*"
+
+
 def components(y: Y, ndim: int = 0) -> dict[str, np.ndarray]:
     """The scalar components of a state by name.
 

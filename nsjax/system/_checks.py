@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool
 
 from .._numerics._jaxpr import is_constant
 from .._numerics._select import select
-from .._numerics._text import did_you_mean
+from .._numerics._text import did_you_mean, outline
 from .._types import Scalar, Y
 from ._clock import clock
 from ._impact import impact
@@ -82,7 +82,7 @@ def check_model(system: System, t: Scalar, y: Y, direction: Scalar) -> Scalar:
     have, want = jax.tree.structure(out), jax.tree.structure(y)
     if have != want:
         raise ValueError(
-            f"`{name}.vector_field` must return the structure of the state, {want}, but returned {have}. "
+            f"`{name}.vector_field` must return the structure of the state, {outline(y)}, but returned {outline(out)}. "
             "Return the same kind of tuple, dictionary or array as `y0`."
         )
     for (path, f), x in zip(jax.tree_util.tree_leaves_with_path(out), jax.tree.leaves(y)):

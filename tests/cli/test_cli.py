@@ -222,6 +222,7 @@ def test_state_that_is_an_array(thermostat, tmp_path, monkeypatch):
         ("orbit 3.4 --set m=1,q=1", "'q'"),
         ("orbit 3.4 --set vdr=1", "'vdr'.*Did you mean 'v_dr'"),
         ("orbit 3.4 --set f_stick=1", "Did you mean 'F_stick'"),
+        ("run 3.4 --set F_stick=0.5", "breakaway` must be at least 1.* but is 0.5"),
         ("orbit 3.4 --y0 V=1", "'V'.*Did you mean 'v'"),
         ("orbit 3.4 --mode bel=1", "'bel'.*Did you mean 'belt'"),
         ("orbit 3.4 --set m=heavy", "m must be a number.*'heavy'"),

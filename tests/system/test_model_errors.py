@@ -88,7 +88,7 @@ MODELS = {
     "other structure": (
         friction(lambda t, y, s: (y.v, -s.belt)),
         ValueError,
-        "`Model.vector_field` must return the structure of the state",
+        r"`Model.vector_field` must return the structure of the state, Motion\(x, v\), but returned \(\*, \*\)",
     ),
     "other shape": (
         friction(lambda t, y, s: Motion(y.v, -s.belt * jnp.ones(2))),
