@@ -244,22 +244,30 @@ class SwitchedSystem(Clocked):
 
     def level(self, k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
         """What its multiplier keeps at zero: the active component of h; for a contact dh/dt, on which forces act."""
+        return self.levels((k,), t, y, state)[0]
+
+    def levels(self, which: tuple[int, ...], t: Scalar, y: Y, state: ModeState) -> list[Scalar]:
+        """`level` of several switches. (One field serves all contacts: with one for each, tracing took the square of
+        their number.)"""
         self = self._in(state)
+        contacts = [k for k in which if k in self.contacts]
 
-        def h(t: Scalar, y: Y) -> Scalar:
-            return pick(self.h(k, t, y), state.part[k])
+        def h(which: Sequence[int], t: Scalar, y: Y) -> list[Scalar]:
+            return [pick(self.h(k, t, y), state.part[k]) for k in which]
 
-        if k not in self.contacts:
-            return h(t, y)
-        zeros = tuple(jnp.zeros((), t.dtype) for _ in self.switches)
-        return jax.jvp(h, (t, y), (jnp.ones_like(t), self.field(t, y, zeros)))[1]
+        rates: dict[int, Scalar] = {}
+        if contacts:
+            zeros = tuple(jnp.zeros((), t.dtype) for _ in self.switches)
+            along = jnp.ones_like(t), self.field(t, y, zeros)
+            rates = dict(zip(contacts, jax.jvp(ft.partial(h, contacts), (t, y), along)[1]))
+        return [rates[k] if k in rates else h((k,), t, y)[0] for k in which]
 
     def rates(self, which: tuple[int, ...], t: Scalar, y: Y, state: ModeState, s: tuple) -> tuple[Scalar, ...]:
         """The rates of change of `level` for each switch in `which`, for switch values `s`."""
         self = self._in(state)
 
         def levels(t: Scalar, y: Y) -> tuple[Scalar, ...]:
-            return tuple(self.level(k, t, y, state) for k in which)
+            return tuple(self.levels(which, t, y, state))
 
         return jax.jvp(levels, (t, y), (jnp.ones_like(t), self.field(t, y, s)))[1]
 

@@ -28,7 +28,7 @@ def linearised(model: "SwitchedSystem", t: Scalar, y: Y, state: ModeState, s: tu
         return jax.tree.leaves(model.field(t, y, put(s, model.holdable, values)))
 
     def levels(t: Scalar, *leaves: Any) -> list[Scalar]:
-        return [model.level(k, t, jax.tree.unflatten(tree, leaves), state) for k in model.holdable]
+        return model.levels(model.holdable, t, jax.tree.unflatten(tree, leaves), state)
 
     near = linearise(field, tuple(s[k] for k in model.holdable), levels, t, y, model.acts, model.coupling)
     if model.contacts and len(model.holdable) > 1:
@@ -141,4 +141,4 @@ def project(model: "SwitchedSystem", t: Scalar, y: Y, state: ModeState, s: tuple
         push = near.pulled(jax.tree.map(jnp.zeros_like, y), closing(gaps))
         dq = jax.jvp(lambda y: model.field(t, y, s), (y,), (push,))[1]
         y = jax.tree.map(jnp.add, y, dq)
-    return near.pulled(y, closing([model.level(k, t, y, state) for k in which]))
+    return near.pulled(y, closing(model.levels(which, t, y, state)))

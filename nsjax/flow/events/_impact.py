@@ -41,7 +41,7 @@ def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) ->
 
     def opening(y: Y) -> list[Scalar]:
         # Only dh/dt depends on the velocities, and for given positions it is affine in them.
-        return [model.level(j, t, y, state) if j in model.contacts else model.approach(j, t, y, state) for j in which]
+        return [model.approach(k, t, y, state)] if k not in model.contacts else model.levels(which, t, y, state)
 
     def hit(s: tuple) -> tuple[Y, Y]:
         def push(j: int) -> Y:
