@@ -15,7 +15,7 @@ from .._types import Scalar, Y
 from ..flow._arguments import checked_state, checked_time
 from ..flow._results import raise_if, RESULTS
 from ..flow._solution import Events
-from ..flow.events._impact import completed, rebound
+from ..flow.events._impact import completed, Gap, rebound
 from ..system._impact import impact
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
@@ -51,14 +51,15 @@ def after_event(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState
     none = jnp.zeros_like(t)
     if not model.switches[k].jumps:
         return y, none
-    bounced, _ = rebound(model, k, t, y, state)
+    gap = Gap.of(model, k)
+    bounced, _ = rebound(gap, t, y, state)
     if not isinstance(model.switches[k], impact):
         return bounced, none
     # (Between two ticks: a segment that follows may be the first of the next period.)
     after = tuple(state.mode[j] if j in model.clocks else m for j, m in enumerate(after))
     free = jnp.zeros_like(after[k])
     flight = model.state_at(t, bounced, after[:k] + (free,) + after[k + 1 :])
-    end = completed(model, k, t, y, bounced, state, flight)
+    end = completed(gap, t, y, bounced, state, flight)
     lands, rests = state.mode[k] == 0, after[k] == 1  # to lift off is no jump
     rest = select(rests, end.rest, 0)
     held = _held(model, t + rest, end.y, after)

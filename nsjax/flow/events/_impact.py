@@ -1,8 +1,9 @@
 """The jump of an impact: one rebound, and the sum of all that follow up to rest."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -14,34 +15,91 @@ from ..._numerics._linalg import linear_solve
 from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._impact import impact
-from ...system._mode import ModeState, OFF, put
+from ...system._mode import ModeState, OFF, pick, put
 from ...system._model import SwitchedSystem
 from ...system._switch import ResettingSwitch
 
 
-def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) -> tuple[Y, Y]:
-    """The state after an impact, by the user's reset or by Newton's law with the impulse along ∂f/∂s; and the size of
+class Gap(eqx.Module):
+    """The indicator function of a switch whose events reset the state; or of several impacts by Newton's law, of which
+    one has `fired`: worked out once, and not for each of them, what they lead to is a program that grows with their
+    number and not with its square."""
+
+    model: SwitchedSystem
+    which: tuple[int, ...] = eqx.field(static=True)
+    fired: tuple[Bool[Array, ""], ...]
+
+    @classmethod
+    def of(cls, model: SwitchedSystem, k: int) -> "Gap":
+        return cls(model, (k,), (jnp.ones((), bool),))
+
+    @property
+    def switch(self) -> ResettingSwitch:
+        switch = self.model.switches[self.which[0]]
+        assert isinstance(switch, ResettingSwitch)
+        return switch
+
+    @property
+    def closes(self) -> bool:
+        """Whether h >= 0: of an impact, and not of a surface that is crossed."""
+        return isinstance(self.switch, impact)
+
+    def chosen(self, numbers: Sequence[Any]) -> Any:
+        """Of numbers for each of the switches that of the one which has fired."""
+        out = numbers[0]
+        for now, number in zip(self.fired[1:], numbers[1:]):
+            out = jax.tree.map(lambda a, b, now=now: select(now, a, b), number, out)
+        return out
+
+    def h(self, t: Scalar, y: Y) -> tuple[Scalar, ...]:
+        return self.chosen([self.model.h(k, t, y) for k in self.which])
+
+    def part(self, state: ModeState) -> Any:
+        """The component that is active."""
+        part = state.part[self.which[0]]
+        return 0 if part is None else part
+
+    def rate(self, t: Scalar, y: Y, state: ModeState, f: Y | None = None) -> Scalar:
+        """dh/dt along the flow. `f`: the field there, if it is known."""
+        f = self.model.flow(t, y, state) if f is None else f
+        part = state.part[self.which[0]]
+        return jax.jvp(lambda t, y: pick(self.h(t, y), part), (t, y), (jnp.ones_like(t), f))[1]
+
+    def slow(self, t: Scalar, y: Y, state: ModeState, f: Y | None = None) -> Scalar:
+        """What rounding can make of dh/dt along the flow."""
+        gap, t, y = frozen((self, t, y))
+        f = gap.model.flow(t, y, state) if f is None else frozen(f)
+        terms = gap.model.sizes(gap.h, t, y, jnp.ones_like(t), f)
+        return 64 * jnp.finfo(t.dtype).eps * terms[gap.part(state)]
+
+
+def rebound(gap: Gap, t: Scalar, y: Y, state: ModeState) -> tuple[Y, Y]:
+    """The state after an event, by the user's reset or by Newton's law with the impulse along ∂f/∂s; and the size of
     the terms of which it is the sum: where they cancel, what is left is their rounding.
 
     Contacts that rest take impulses of their own, as far as these push; friction that the contact force enters acts in
     the impact too, up to where it stops the sliding. Backwards in time Newton's law is inverted (1/e).
     """
-    switch = model.switches[k]
-    if isinstance(switch, ResettingSwitch) and switch.reset_fn is not None:
+    model, switch = gap.model, gap.switch
+    if switch.reset_fn is not None:
         out = switch.reset_fn(model.system, model.time(t), y)
         if switch.inverse_fn is not None:
             undone = switch.inverse_fn(model.system, model.time(t), y)
             out = jax.tree.map(lambda a, b: select(model.direction > 0, a, b), out, undone)
         return out, jax.tree.map(lambda a, b: jnp.abs(a) + jnp.abs(b), y, out)
-    assert isinstance(switch, impact) and switch.restitution_fn is not None
-    e = jnp.asarray(switch.restitution_fn(model.system), t.dtype)
+    fired, factors = dict(zip(gap.which, gap.fired)), []
+    for k in gap.which:
+        law = model.switches[k]
+        assert isinstance(law, impact) and law.restitution_fn is not None
+        factors.append(jnp.asarray(law.restitution_fn(model.system), t.dtype))
+    e = gap.chosen(factors)
     e = select(model.direction > 0, e, 1 / e)
-    which = (k, *[j for j in model.contacts if j != k and k in model.contacts])
-    takes_part = jnp.stack([jnp.ones((), bool)] + [state.mode[j] == 1 for j in which[1:]])
+    k, rest = gap.which[0], gap.which[0] in model.contacts
+    which = (*gap.which, *[j for j in model.contacts if j not in gap.which and rest])
 
     def opening(y: Y) -> list[Scalar]:
         # Only dh/dt depends on the velocities, and for given positions it is affine in them.
-        return [model.approach(k, t, y, state)] if k not in model.contacts else model.levels(which, t, y, state)
+        return model.levels(which, t, y, state) if rest else [model.approach(k, t, y, state)]
 
     def hit(s: tuple) -> tuple[Y, Y]:
         def push(j: int) -> Y:
@@ -54,15 +112,17 @@ def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) ->
         if len(which) == 1:
             impulses = [-(1 + e) * rates[0] / gains[0][0]]
         else:
-            want = jnp.stack([-(1 + e) * rates[0]] + [-r for r in rates[1:]])
+            none = jnp.zeros((), bool)
+            hits = jnp.stack([fired.get(j, none) for j in which])
+            want = -select(hits, 1 + e, 1) * jnp.stack(rates)
             matrix = jnp.stack([jnp.stack(g) for g in gains], axis=1)
             # Contacts can only push: a linear complementarity problem. What would pull is let go and not taken back, so
             # that there are no more rounds than contacts, a number that is known when the program is made.
-            held = takes_part
+            held = hits | jnp.stack([state.mode[j] == 1 for j in which])
             for _ in which[1:]:
                 square = select(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
                 p = linear_solve(square, select(held, want, 0))
-                held = held & ((p >= 0) | (jnp.arange(len(which)) == 0))  # no contact pulls
+                held = held & ((p >= 0) | hits)  # no contact pulls
             square = select(held[:, None] & held[None, :], matrix, jnp.eye(len(which), dtype=t.dtype))
             impulses = list(linear_solve(square, select(held, want, 0)))
         out, size = y, jax.tree.map(jnp.abs, y)
@@ -77,10 +137,12 @@ def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) ->
             continue
 
         begin, still = model.level(j, t, y, state), state.mode[j] == 0
-        if model.contact[j] == k:  # it is there for the instant of the impact
+        its = fired.get(model.contact[j])  # whether it is there for the instant of the impact
+        if its is not None:
             (noise,) = model.rounding(lambda t, y, j=j: (model.level(j, t, y, state),), t, y)
-            still = still | ((state.mode[j] == OFF) & (jnp.abs(begin) <= noise))
-            s = put(s, (j,), (select(state.mode[j] == OFF, select(still, 0, jnp.sign(begin)), s[j]),))
+            off = its & (state.mode[j] == OFF)
+            still = still | (off & (jnp.abs(begin) <= noise))
+            s = put(s, (j,), (select(off, select(still, 0, jnp.sign(begin)), s[j]),))
 
         def slip(sj: Scalar, j: int = j, s: tuple = s) -> Scalar:
             return model.level(j, t, hit(put(s, (j,), (sj,)))[0], state)
@@ -89,18 +151,10 @@ def rebound(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState) ->
         end, slope = jax.jvp(slip, (s[j],), (jnp.ones_like(s[j]),))
         stop = s[j] - end / select(slope == 0, 1, slope)
         new = select(~still & (begin * end < 0) & (slope != 0) & (jnp.abs(stop) <= 1), stop, s[j])
-        if model.contact[j] == k:  # what does not slide goes on so, as far as friction can keep it
-            new = select(still & (state.mode[j] == OFF) & (slope != 0), jnp.clip(stop, -1, 1), new)
+        if its is not None:  # what does not slide goes on so, as far as friction can keep it
+            new = select(its & still & (state.mode[j] == OFF) & (slope != 0), jnp.clip(stop, -1, 1), new)
         s = put(s, (j,), (new,))
     return hit(s)
-
-
-def slow(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState, f: Y | None = None) -> Scalar:
-    """What rounding can make of dh/dt of switch k along the flow. `f`: the field there, if it is known."""
-    model, t, y = frozen((model, t, y))
-    f = model.flow(t, y, state) if f is None else frozen(f)
-    terms = model.sizes(lambda t, y: model.h(k, t, y), t, y, jnp.ones_like(t), f)
-    return 64 * jnp.finfo(t.dtype).eps * terms[0 if state.part[k] is None else state.part[k]]
 
 
 class Completed(NamedTuple):
@@ -116,29 +170,27 @@ class Completed(NamedTuple):
     wrong: Bool[Array, ""]  # whether the reset leads to the forbidden side
 
 
-def completed(
-    model: SwitchedSystem, k: int, te: Scalar, before: Y, after: Y, state: ModeState, state_after: ModeState
-) -> Completed:
+def completed(gap: Gap, te: Scalar, before: Y, after: Y, state: ModeState, state_after: ModeState) -> Completed:
     """Checks an impact, and sums the sequence of ever shorter flights that follows it up to its accumulation point.
 
     With the velocity h' after the impact, the acceleration h'' < 0 and the ratio r = -h'(t+)/h'(t-) < 1 the remaining
     flights last 2 h' / (-h'') (1 + r + r² + ...). For a surface that is crossed h is taken with the sign it has.
     """
-    eps = jnp.finfo(te.dtype).eps
-    speed = model.approach(k, te, before, state)
-    rate, state_after = _away(model, k, te, after, state_after)
-    if not isinstance(model.switches[k], impact):
-        speed = speed * state.mode[k].astype(te.dtype)
+    model, eps = gap.model, jnp.finfo(te.dtype).eps
+    speed = gap.rate(te, before, state)
+    rate, state_after = _away(gap, te, after, state_after)
+    if not gap.closes:
+        speed = speed * state.mode[gap.which[0]].astype(te.dtype)
     rise, pull, f = _departure(model, rate, te, after, state_after)
     (blur,) = model.rounding(lambda t, y: (_departure(model, rate, t, y, state_after)[1],), te, after)
-    h = jnp.stack(model.h(k, te, after))
-    noise = model.rounding(lambda t, y: model.h(k, t, y), te, after)
-    slack = 1e4 * noise + 2 * jnp.abs(jnp.stack(model.h(k, te, before)))
-    part = 0 if state_after.part[k] is None else state_after.part[k]
+    h = jnp.stack(gap.h(te, after))
+    noise = model.rounding(gap.h, te, after)
+    slack = 1e4 * noise + 2 * jnp.abs(jnp.stack(gap.h(te, before)))
+    part = gap.part(state_after)
     stays = jnp.abs(h[part]) <= slack[part]
-    least = 64 * eps * jnp.abs(speed) + slow(model, k, te, after, state_after)
+    least = 64 * eps * jnp.abs(speed) + gap.slow(te, after, state_after)
     wrong = stays & (rise < -jnp.maximum(1e-9 * jnp.abs(speed), least))
-    if isinstance(model.switches[k], impact):
+    if gap.closes:
         wrong = jnp.any(h < -slack) | wrong
     ratio = select(speed == 0, 0, -rise / select(speed == 0, 1, speed))
     rises = rise > least
@@ -147,9 +199,8 @@ def completed(
     held = stays & ~rises & (jnp.abs(pull) <= blur)  # without any force
     possible = stays & ~wrong & ((pull < 0) | held) & (ratio < 1)
     impulse = jax.tree.map(jnp.subtract, after, before)
-    switch = model.switches[k]
-    if isinstance(switch, ResettingSwitch) and switch.reset_fn is not None:
-        rest, rested = _rest_after_resets(model, k, te, after, impulse, state_after, possible & rises)
+    if gap.switch.reset_fn is not None:
+        rest, rested = _rest_after_resets(gap, te, after, impulse, state_after, possible & rises)
     else:
         rest = select(possible, flight / (1 - select(possible, ratio, 0)), 0)
         drift = jax.tree.map(lambda x, f: x + rest * f, after, f)
@@ -160,17 +211,15 @@ def completed(
     return Completed(rises, flight, rest, rested, possible, low, stays, wrong)
 
 
-def _away(
-    model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState
-) -> tuple[Callable[[Scalar, Y], Scalar], ModeState]:
+def _away(gap: Gap, t: Scalar, y: Y, state: ModeState) -> tuple[Callable[[Scalar, Y], Scalar], ModeState]:
     """dh/dt as a function of time and state, counted positive away from the surface, and the mode of the flight that
     begins at `t`, `y`. (From a surface that is crossed it leads to the side to which h moves.)"""
-    if isinstance(model.switches[k], impact):
-        return lambda t, y: model.approach(k, t, y, state), state
-    rate = frozen(model.approach(k, t, y, state))
+    if gap.closes:
+        return lambda t, y: gap.rate(t, y, state), state
+    (k,), rate = gap.which, frozen(gap.rate(t, y, state))
     side = select(rate == 0, state.mode[k], jnp.sign(rate).astype(jnp.int32))
     state = state._replace(mode=put(state.mode, (k,), (side,)))
-    return lambda t, y: side.astype(t.dtype) * model.approach(k, t, y, state), state
+    return lambda t, y: side.astype(t.dtype) * gap.rate(t, y, state), state
 
 
 def _departure(
@@ -183,7 +232,7 @@ def _departure(
 
 
 def _rest_after_resets(
-    model: SwitchedSystem, k: int, t: Scalar, y: Y, impulse: Y, state: ModeState, wanted: Bool[Array, ""]
+    gap: Gap, t: Scalar, y: Y, impulse: Y, state: ModeState, wanted: Bool[Array, ""]
 ) -> tuple[Scalar, Y]:
     """How long all flights together last that follow an event with a reset of the user's, and the state after them.
 
@@ -192,18 +241,18 @@ def _rest_after_resets(
     counter, a sign) has no limit: it keeps the value that it has, apart from its drift. `impulse`: what the reset has
     just changed.
     """
-    start, length, speeds = y, jnp.zeros_like(t), []
+    model, start, length, speeds = gap.model, y, jnp.zeros_like(t), []
     last = jax.tree.map(jnp.zeros_like, y)
     for _ in range(2):
-        rate, state = _away(model, k, t, y, state)
+        rate, state = _away(gap, t, y, state)
         rise, pull, f = _departure(model, rate, t, y, state)
         flight = 2 * rise / select(pull < 0, -pull, 1)
         landing = jax.tree.map(lambda x, f, flight=flight: x + flight * f, y, f)
-        y = rebound(model, k, t, landing, state)[0]
+        y = rebound(gap, t, landing, state)[0]
         last = jax.tree.map(jnp.subtract, y, landing)
         length = length + flight
         speeds.append(rise)
-    rate, _ = _away(model, k, t, y, state)
+    rate, _ = _away(gap, t, y, state)
     ratio = rate(t, y) / select(wanted, speeds[0], 1)
     again = 1 / (1 - select(wanted & (ratio < 1), ratio, 0))
     rest = select(wanted, length * again, 0)

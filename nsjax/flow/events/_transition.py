@@ -21,7 +21,7 @@ from ...system._relay import relay
 from ...system._sgn import sgn
 from .._results import RESULTS
 from ..steppers._stepper import stack, Stepper
-from ._impact import completed, rebound, slow
+from ._impact import completed, Gap, rebound
 from ._locate import encounter, Interval, locate, Located, step_to
 from ._mode_choice import settle
 
@@ -186,21 +186,40 @@ class _Event:
         for k, switch in enumerate(model.switches):
             if isinstance(switch, (relay, clock)):
                 modes[k] = select(self.fired[k], switch.next_mode(modes[k], model.direction), modes[k])
-            if not switch.jumps:
-                continue
-            touching = self.state._replace(part=tuple(self.parts))
-            if not isinstance(switch, clock):
-                # Another impact at this instant may have opened it: then h < 0 is rounding.
-                rate = model.approach(k, t, before, touching)
-                if not isinstance(switch, impact):
-                    rate = self.state.mode[k].astype(t.dtype) * rate
-                opens = self.fired[k] & (rate > slow(model, k, t, before, touching))
-                self.roots[k] = select(opens, 1, self.roots[k])
-                self.fired[k] = self.fired[k] & ~opens
+        touching = self.state._replace(part=tuple(self.parts))
+        for which in self.jumping():
             # A reset by a clock sees functions of time as they are after the tick.
-            hit = rebound(model.within(tuple(modes)) if k in model.clocks else model, k, t, before, touching)
+            ticks = which[0] in model.clocks
+            gap = self.gap(which, model.within(tuple(modes)) if ticks else model)
+            if not ticks:
+                # Another impact at this instant may have opened it: then h < 0 is rounding.
+                rate = gap.rate(t, before, touching)
+                if not gap.closes:
+                    rate = self.state.mode[which[0]].astype(t.dtype) * rate
+                away = rate > gap.slow(t, before, touching)
+                for k in which:
+                    opens = self.fired[k] & away
+                    self.roots[k] = select(opens, 1, self.roots[k])
+                    self.fired[k] = self.fired[k] & ~opens
+            hit = rebound(gap, t, before, touching)
+            now = ft.reduce(jnp.logical_or, [self.fired[k] for k in which])
             now_and_then = hit, (self.after, self.size)
-            self.after, self.size = jax.tree.map(lambda a, b, now=self.fired[k]: select(now, a, b), *now_and_then)
+            self.after, self.size = jax.tree.map(lambda a, b, now=now: select(now, a, b), *now_and_then)
+
+    def jumping(self) -> list[tuple[int, ...]]:
+        """The switches whose events change the state. Impacts by Newton's law that can be rested upon are one group, as
+        only one of them fires at an event."""
+        model = self.model
+
+        def alike(k: int) -> bool:
+            switch = model.switches[k]
+            return k in model.contacts and isinstance(switch, impact) and switch.reset_fn is None
+
+        group = tuple(filter(alike, model.jumping))
+        return ([group] if group else []) + [(k,) for k in model.jumping if k not in group]
+
+    def gap(self, which: tuple[int, ...], model: SwitchedSystem) -> Gap:
+        return Gap(model, which, tuple(self.fired[k] for k in which))
 
     def is_contested(self) -> Bool[Array, ""]:
         """Whether an impact changes the speed at which another contact, met at the same instant, closes: which of the
@@ -215,7 +234,7 @@ class _Event:
             other = ft.reduce(jnp.logical_or, [self.fired[j] for j in impacts if j != k])
             h, noise = model.least(k, t, before), jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, before))
             speeds = [model.approach(k, t, y, self.state, f) for y, f in zip((before, after), fields)]
-            least = jnp.maximum(*[slow(model, k, t, y, self.state, f) for y, f in zip((before, after), fields)])
+            least = jnp.maximum(*[Gap.of(model, k).slow(t, y, self.state, f) for y, f in zip((before, after), fields)])
             meets = (self.state.mode[k] == 0) & (jnp.abs(h) <= 1e4 * noise) & (jnp.minimum(*speeds) < -least)
             contested = contested | (other & meets & (jnp.abs(speeds[1] - speeds[0]) > least))
         return frozen(contested)
@@ -272,25 +291,26 @@ class _Event:
         model, t, state, jumped = self.model, self.t, self.mode_state(), self.after
         eps = jnp.finfo(t.dtype).eps
         brief = jnp.maximum(jnp.sqrt(eps) * (t - self.begin), 1e4 * eps * jnp.abs(t))
-        for k in model.jumping:
-            if k in model.clocks:
+        for which in self.jumping():
+            if which[0] in model.clocks:
                 continue
-            fired = self.fired[k]
-            end = completed(model, k, t, self.before, jumped, self.state, state)
+            fired = ft.reduce(jnp.logical_or, [self.fired[k] for k in which])
+            end = completed(self.gap(which, model), t, self.before, jumped, self.state, state)
             ends = fired & end.possible & ((end.flight <= brief) | end.low)
             self.t_after, self.after = jax.tree.map(
                 lambda a, b, ends=ends: select(ends, a, b), (t + end.rest, end.y), (self.t_after, self.after)
             )
             self.result = RESULTS.where(fired & end.wrong, RESULTS.wrong_reset, self.result)
             fresh = select(end.stays, select(end.rises, 1, 2), 0)
-            if isinstance(model.switches[k], impact):
-                self.roots[k] = select(fired, fresh, self.roots[k]).astype(jnp.int32)
-            if k in model.contacts:
-                moved = self.set_in_motion(k, state, jumped, brief)
-                self.at[k] = ends | ((self.modes[k] == 1) & ~moved)
-            else:
-                reached = ends & (self.result == RESULTS.successful)
-                self.result = RESULTS.where(reached, RESULTS.accumulation_reached, self.result)
+            for k in which:
+                if isinstance(model.switches[k], impact):
+                    self.roots[k] = select(self.fired[k], fresh, self.roots[k]).astype(jnp.int32)
+                if k in model.contacts:
+                    moved = self.set_in_motion(k, state, jumped, brief)
+                    self.at[k] = (ends & self.fired[k]) | ((self.modes[k] == 1) & ~moved)
+                else:
+                    reached = ends & (self.result == RESULTS.successful)
+                    self.result = RESULTS.where(reached, RESULTS.accumulation_reached, self.result)
 
     def set_in_motion(self, k: int, state: ModeState, y: Y, brief: Scalar) -> Bool[Array, ""]:
         """Whether another impact sets a resting contact in motion: it lifts off for more than a brief flight, or is hit
