@@ -158,8 +158,8 @@ def dependence(fn: Callable[[Any], Any], x: Any) -> np.ndarray:
 
 _NOT_NEGATIVE = frozenset("abs cosh exp exp2 logistic sqrt square".split())
 _KEEPING_SIGN = frozenset(MOVING) | frozenset(
-    "add add_any convert_element_type copy cumsum div max min mul pow reduce_max reduce_min reduce_precision "
-    "select_n stop_gradient".split()
+    "add add_any convert_element_type copy cumsum div min mul reduce_max reduce_min reduce_precision "
+    "stop_gradient".split()
 )
 
 

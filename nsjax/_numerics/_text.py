@@ -44,7 +44,7 @@ def known(tree: Any) -> bool:
 
 
 def outline(tree: Any) -> str:
-    """The structure of a pytree in words: `State(x, v)`, `{'x': *, 'v': *}`, `(*, [*, *])`; a leaf is `*`."""
+    """Returns the structure of a pytree in words: `State(x, v)`, `{'x': *, 'v': *}`, `(*, [*, *])`; a leaf is `*`."""
     if isinstance(tree, dict):
         return "{" + ", ".join(f"{key!r}: {outline(value)}" for key, value in tree.items()) + "}"
     fields = getattr(tree, "_fields", None) or tuple(getattr(tree, "__dataclass_fields__", ()))

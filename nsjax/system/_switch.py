@@ -171,6 +171,7 @@ class ResettingSwitch(AbstractSwitch):
         return self.reset_fn is not None
 
     def _check_sign(self, system: "System", t: Scalar, y: Y) -> None:
+        """Raises if the indicator function cannot be negative, so that it has no crossing."""
         if all(never_negative(lambda at: self.components(system, *at), (t, y))):
             raise ValueError(
                 f"`{type(system).__name__}.{self.name}` is never negative (a square, an absolute value), so that a "
@@ -180,6 +181,7 @@ class ResettingSwitch(AbstractSwitch):
             )
 
     def _check_reset(self, system: "System", t: Scalar, y: Y) -> None:
+        """Raises if the reset or its inverse does not return a state of the model's structure and shapes."""
         owner, name = type(system).__name__, self.name
         if self.inverse_fn is not None and self.reset_fn is None:
             raise ValueError(f"`{owner}.{name}.inverse` undoes a reset, but there is no `@{name}.reset`.")

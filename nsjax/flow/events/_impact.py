@@ -45,7 +45,7 @@ class Gap(eqx.Module):
         return isinstance(self.switch, impact)
 
     def chosen(self, numbers: Sequence[Any]) -> Any:
-        """Of numbers for each of the switches that of the one which has fired."""
+        """Selects from `numbers`, one for each switch, that of the switch which has fired."""
         out = numbers[0]
         for now, number in zip(self.fired[1:], numbers[1:]):
             out = jax.tree.map(lambda a, b, now=now: select(now, a, b), number, out)
@@ -94,12 +94,12 @@ def rebound(gap: Gap, t: Scalar, y: Y, state: ModeState) -> tuple[Y, Y]:
         factors.append(jnp.asarray(law.restitution_fn(model.system), t.dtype))
     e = gap.chosen(factors)
     e = select(model.direction > 0, e, 1 / e)
-    k, rest = gap.which[0], gap.which[0] in model.contacts
-    which = (*gap.which, *[j for j in model.contacts if j not in gap.which and rest])
+    k, can_rest = gap.which[0], gap.which[0] in model.contacts
+    which = (*gap.which, *[j for j in model.contacts if j not in gap.which and can_rest])
 
     def opening(y: Y) -> list[Scalar]:
         # Only dh/dt depends on the velocities, and for given positions it is affine in them.
-        return model.levels(which, t, y, state) if rest else [model.approach(k, t, y, state)]
+        return model.levels(which, t, y, state) if can_rest else [model.approach(k, t, y, state)]
 
     def hit(s: tuple) -> tuple[Y, Y]:
         def push(j: int) -> Y:
