@@ -63,7 +63,7 @@ def explain(system: Any, sol: Solution, t1: Any) -> str:
 
 
 def _wrong_contact(system: Any, sol: Solution) -> str:
-    """Which contact force acts in the wrong direction, or on the wrong derivative of its gap."""
+    """Names the contact force that acts in the wrong direction, or on the wrong derivative of its gap."""
     owner, model = type(system).__name__, SwitchedSystem.forwards(system, sol.t1, sol.y1).at(sol.t1)
     for k, wrong in forces_on_speeds(model, sol.t1, sol.y1).items():
         if wrong:
@@ -83,7 +83,7 @@ def _wrong_contact(system: Any, sol: Solution) -> str:
 
 
 def _steps_wanted(sol: Solution, t1: float) -> str:
-    """What to write where the steps did not suffice: how many it takes at the rate so far, if that is any number."""
+    """Returns how far the steps sufficed, and the `max_steps` that would do if the solution went on at that rate."""
     most, begin, end = sol.stats["max_steps"], float(sol.t0), float(sol.t1)
     part = (end - begin) / (t1 - begin)
     text = f"The maximum number of solver steps, `max_steps={most}`, was reached after {100 * part:.2g} % of the time."
@@ -101,8 +101,8 @@ def _steps_wanted(sol: Solution, t1: float) -> str:
 
 
 def _rests_unheld(system: Any, sol: Solution) -> str | None:
-    """A `sgn` that does not act on dh/dt, on whose surface the solution has come to rest with forces towards it on
-    both sides."""
+    """Returns the name of a `sgn` that does not act on dh/dt, and on whose surface the solution has come to rest with
+    forces towards it on both sides; or None."""
     model = SwitchedSystem.forwards(system, sol.t1, sol.y1).at(sol.t1)
     t, y = sol.t1, sol.y1
     for k, switch in enumerate(model.switches):

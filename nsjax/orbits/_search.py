@@ -98,7 +98,7 @@ class Search(NamedTuple):
             yield given | {name: jnp.asarray(value, jnp.int32) for name, value in zip(names, values)}
 
     def failure(self, system: System, y0: Y) -> str | None:
-        """Why the solution from the guess ends early, if it does."""
+        """Returns why and where the solution from the guess fails, or None if it does not."""
         return failure(frozen(system), self.t0, lax.stop_gradient(y0), self.sign, self.mode, self.integrator)
 
     def _at_rest(self, system: System, y: Y) -> RESULTS:

@@ -76,7 +76,7 @@ def settle_down(
 
 
 def failure(system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrator: Integrator) -> str | None:
-    """Why the solution from a guess ends early, if it does, and where."""
+    """Returns why and where the solution from a guess fails, or None if it does not."""
     if system.period is None:
         end, integrator = t0 + sign * FAR, _loose(integrator, t0.dtype)
     else:

@@ -51,7 +51,7 @@ def _pulled(switch: sgn) -> sgn:
 
 
 def _slides(switch: AbstractSwitch) -> bool:
-    """Whether it is a sign that is replaced; one whose events reset the state remains."""
+    """Whether the switch is a sign that is replaced. One whose events reset the state remains."""
     return isinstance(switch, sgn) and not switch.jumps
 
 

@@ -203,8 +203,8 @@ def _changes(system: System, t: Scalar, y: Y) -> Array:
 
 
 def forces_on_speeds(model: SwitchedSystem, t: Scalar, y: Y) -> dict[int, Bool[Array, ""]]:
-    """Of each impact with a coefficient of restitution that cannot be rested upon, whether its contact force acts on
-    dh/dt: then there is no impulse that changes dh/dt by a finite amount."""
+    """Tells for each impact with a coefficient of restitution that cannot be rested upon whether its contact force acts
+    on dh/dt. Then no impulse changes dh/dt by a finite amount."""
     zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
     found = {}
     for k in model.of_kind(impact):

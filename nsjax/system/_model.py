@@ -225,8 +225,8 @@ class SwitchedSystem(Clocked):
         return bool(np.any(np.stack(modes)[:, switches] == holding))
 
     def gap_is_held(self, contact: int, friction: int, t: Scalar, y: Y, state: ModeState) -> Bool[Array, ""]:
-        """Whether friction along the normal of a contact sticks and so keeps its gap as it is: the rate of the gap is a
-        multiple of the sliding velocity. (What is left of a gap of zero would be rounding.)"""
+        """Whether friction along the normal of a contact sticks and so keeps its gap as it is, since the rate of the
+        gap is a multiple of the sliding velocity. (A gap of zero would be left with its rounding.)"""
         model, t, y = frozen((self._in(state), t, y))
 
         def both(t: Scalar, y: Y) -> tuple[Scalar, Scalar]:

@@ -21,9 +21,12 @@ from ...system._switch import ResettingSwitch
 
 
 class Gap(eqx.Module):
-    """The indicator function of a switch whose events reset the state; or of several impacts by Newton's law, of which
-    one has `fired`: worked out once, and not for each of them, what they lead to is a program that grows with their
-    number and not with its square."""
+    """The indicator function of a switch whose events reset the state, or of several impacts by Newton's law, of which
+    one has `fired`.
+
+    What the impact leads to is worked out once for the group: worked out for each contact, the program grew with the
+    square of their number.
+    """
 
     model: SwitchedSystem
     which: tuple[int, ...] = eqx.field(static=True)
@@ -41,7 +44,7 @@ class Gap(eqx.Module):
 
     @property
     def closes(self) -> bool:
-        """Whether h >= 0: of an impact, and not of a surface that is crossed."""
+        """Whether the switch keeps h >= 0, as an impact does; a surface that is crossed does not."""
         return isinstance(self.switch, impact)
 
     def chosen(self, numbers: Sequence[Any]) -> Any:
@@ -66,7 +69,7 @@ class Gap(eqx.Module):
         return jax.jvp(lambda t, y: pick(self.h(t, y), part), (t, y), (jnp.ones_like(t), f))[1]
 
     def slow(self, t: Scalar, y: Y, state: ModeState, f: Y | None = None) -> Scalar:
-        """What rounding can make of dh/dt along the flow."""
+        """Returns the size below which dh/dt along the flow is rounding."""
         gap, t, y = frozen((self, t, y))
         f = gap.model.flow(t, y, state) if f is None else frozen(f)
         terms = gap.model.sizes(gap.h, t, y, jnp.ones_like(t), f)
@@ -234,7 +237,7 @@ def _departure(
 def _rest_after_resets(
     gap: Gap, t: Scalar, y: Y, impulse: Y, state: ModeState, wanted: Bool[Array, ""]
 ) -> tuple[Scalar, Y]:
-    """How long all flights together last that follow an event with a reset of the user's, and the state after them.
+    """Returns the duration of all flights that follow an event with a reset of the user's, and the state after them.
 
     The next two flights are made: the two sides of a surface that is crossed may differ. What they change is repeated
     in the ratio of the speeds before and after them. A component that the reset changes by as much each time (a

@@ -149,7 +149,7 @@ class _Start:
                 self.result = RESULTS.where(below, RESULTS.start_penetrates, self.result)
 
     def speed(self, k: int, state: ModeState, f: Y | None) -> Scalar:
-        """How fast h of switch k changes; where it is held, how fast it would change beside its surface."""
+        """Returns |dh/dt| of switch k; where it is held, that which h would have beside its surface."""
         model, t, y = frozen((self.model, self.t, self.y))
         rate = jnp.abs(frozen(model.approach(k, t, y, state, f)))
         if k not in model.holdable:

@@ -348,7 +348,7 @@ class _Event:
         return self.released(state), forked
 
     def released(self, state: ModeState) -> ModeState:
-        """Where friction lets go that has kept a gap of zero, h and its first two derivatives vanish."""
+        """Notes the roots of gaps of zero that friction has held and lets go: h, dh/dt and d²h/dt² vanish there."""
         later, t, y, roots = self.later, self.t_after, self.after, list(state.roots)
         for i, j in later.normal:
             k, friction = later.holdable[i], later.holdable[j]

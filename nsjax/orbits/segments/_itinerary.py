@@ -89,7 +89,7 @@ def slot_of(model: SwitchedSystem, k: int, holding: bool, part: int) -> int:
 
 
 def ticks(model: SwitchedSystem, itinerary: OrbitItinerary) -> Int[np.ndarray, " switches"]:
-    """By how much each clock has gone on after one passage through an orbit; 0 for other switches."""
+    """Returns how often each clock ticks in one passage through an orbit, and 0 for other switches."""
     count = np.zeros(len(model.switches), np.int32)
     for i in itinerary.rows:
         if itinerary.ends[i] == EVENT and (k := model.slots[int(itinerary.slot[i])].switch) in model.clocks:
