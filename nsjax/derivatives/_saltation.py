@@ -17,7 +17,7 @@ from ..flow._results import raise_if, RESULTS
 from ..flow._solution import Events
 from ..flow.events._impact import completed, Gap, rebound
 from ..system._impact import impact
-from ..system._mode import ModeState
+from ..system._mode import ModeState, put
 from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, System
 
@@ -51,6 +51,9 @@ def after_event(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState
     none = jnp.zeros_like(t)
     if not model.switches[k].jumps:
         return y, none
+    if k in model.clocks:  # its reset sees functions of time as they are after the tick
+        ticked = model.switches[k].next_mode(state.mode[k], model.direction)
+        model = model.within(put(state.mode, (k,), (ticked,)))
     gap = Gap.of(model, k)
     bounced, _ = rebound(gap, t, y, state)
     if not isinstance(model.switches[k], impact):

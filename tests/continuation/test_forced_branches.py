@@ -78,5 +78,4 @@ def test_an_orbit_that_slides_all_along():
     assert "no bifurcation: sliding-mode transition" in str(branch) and not branch.bifurcations
     np.testing.assert_allclose(transition.value, 1.5 * abs(1 + 0.2j - 4), rtol=1e-9)
     assert branch.values[-1] == 6.0 and np.all(branch.stable)
-    size = 6.0 / abs(1 + 0.2j - 4)
-    assert int(branch.orbit(len(branch.values) - 1).events.num) == 4 and size > 1.5
+    assert int(branch.orbit(len(branch.values) - 1).events.num) == 4

@@ -391,3 +391,65 @@ def test_kicks_of_a_ball_at_rest():
     down = solve(Kicked(-0.8), 0.0, 4.0, Motion(0.0, 0.0))
     np.testing.assert_allclose(down.y1, [0.0, 0.0], atol=1e-12)
     assert int(down.mode1[0]) == 1
+
+
+class Forced(Crossing):
+    """A damped and driven oscillator, slowed down wherever x changes its sign."""
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -y.x - 0.1 * y.v + jnp.cos(1.3 * t))
+
+    @property
+    def period(self):
+        return 2 * jnp.pi / 1.3
+
+
+def test_an_orbit_through_a_crossed_surface():
+    """The flow and its derivative confirm the orbit that shooting finds, and the branch in segments."""
+    orbit = nsjax.find_orbit(Forced(), Motion(0.5, 0.5), order=None)
+
+    def end(y):
+        return solve(orbit.system, orbit.t0, orbit.t0 + orbit.period, y, rtol=1e-11, atol=1e-11).y1
+
+    np.testing.assert_allclose(end(orbit.y0), orbit.y0, rtol=1e-9)
+    by_x, by_v = jax.jacfwd(end)(orbit.y0)
+    wanted = np.linalg.eigvals(np.array([[by_x.x, by_x.v], [by_v.x, by_v.v]]))
+    np.testing.assert_allclose(np.sort_complex(orbit.multipliers), np.sort_complex(wanted), rtol=1e-8)
+    branch = nsjax.continue_orbit(orbit.system, orbit, "r", (0.7, 0.8))
+    last = branch.orbit(int(np.argmin(branch.values)))
+    back = solve(last.system, last.t0, last.t0 + last.period, last.y0, rtol=1e-11, atol=1e-11).y1
+    np.testing.assert_allclose(back, last.y0, rtol=1e-8)
+
+
+class TwoDoses(Doses):
+    """Doses of 1 and 3 in turn, chosen by a function of time that jumps at the ticks."""
+
+    def vector_field(self, t, y, s):
+        return Motion(-self.k * y.x, -0.5 * y.v + y.x)
+
+    @nsjax.clock
+    def tick(self):
+        return self.T
+
+    @tick.reset
+    def tick(self, t, y):
+        return Motion(y.x + jnp.where(jnp.floor(t / self.T) % 2 == 0, 1.0, 3.0), y.v)
+
+    @property
+    def period(self):
+        return 2 * self.T
+
+
+@pytest.mark.parametrize("method", ["shooting", "segments"])
+def test_an_orbit_of_two_doses(method):
+    orbit = nsjax.find_orbit(TwoDoses(), Motion(1.0, 1.0), method=method)
+    # After the dose of 1 at t = 0, which the one of 3 at t = T follows.
+    decay = np.exp(-0.21)
+    np.testing.assert_allclose(orbit.y0.x, (1 + 3 * decay) / (1 - decay**2), rtol=1e-9)
+    np.testing.assert_allclose(orbit.multipliers, [np.exp(-0.42), np.exp(-0.7)], rtol=1e-9)
+
+
+def test_the_saltation_matrix_of_a_tick():
+    """The time of a tick does not depend on the state."""
+    matrix = nsjax.saltation_matrix(TwoDoses(), 0.7, Motion(1.0, 1.0), "tick", 0, 1)
+    np.testing.assert_array_equal(matrix, np.eye(2))

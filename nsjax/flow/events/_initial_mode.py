@@ -10,7 +10,7 @@ from ..._numerics._linalg import nearly
 from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...system._impact import impact
-from ...system._mode import ModeState, OFF
+from ...system._mode import ModeState, OFF, put
 from ...system._model import SwitchedSystem
 from ...system._relay import relay
 from ...system._sgn import sgn
@@ -156,9 +156,7 @@ class _Start:
             return rate
 
         def beside(mode: int) -> ModeState:
-            return state._replace(
-                mode=tuple(jnp.asarray(mode if j == k else m, jnp.int32) for j, m in enumerate(state.mode))
-            )
+            return state._replace(mode=put(state.mode, (k,), (jnp.asarray(mode, jnp.int32),)))
 
         if k in model.contacts:  # it would fall for all the time
             free = beside(0)
