@@ -30,7 +30,7 @@ class AbstractSpecialPoint(eqx.Module):
     @property
     def is_bifurcation(self) -> bool:
         """Whether it is one: not where the branch crosses a surface and nothing else happens, where it is vertical
-        without turning back, or where it ends."""
+        without turning back, or where it ends. An "unresolved" point counts: there is at least one beside it."""
         return self.kind not in ("none", "hysteresis point", "end")
 
     @property

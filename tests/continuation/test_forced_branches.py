@@ -1,11 +1,14 @@
 """Branches of forced orbits: of a model with a clock through its flips, and of orbits that slide all along."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import nsjax
+from nsjax.continuation.orbits._bifurcation import OrbitBifurcation, OrbitHalfBranch
 
 
 class Current(NamedTuple):
@@ -34,10 +37,15 @@ class BuckConverter(nsjax.System):
         return 0.4
 
 
-def test_the_flips_of_a_model_with_a_clock():
-    """On an orbit that is passed twice its clock has gone on in the second lap."""
+@pytest.fixture(scope="module")
+def buck():
     orbit = nsjax.find_orbit(BuckConverter(), Current(12.0, 0.5), order=None)
-    branch = nsjax.continue_orbit(orbit.system, orbit, "V_in", (18.0, 31.5), max_laps=2)
+    return nsjax.continue_orbit(orbit.system, orbit, "V_in", (18.0, 31.5), max_laps=2)
+
+
+def test_the_flips_of_a_model_with_a_clock(buck):
+    """On an orbit that is passed twice its clock has gone on in the second lap."""
+    branch = buck
     np.testing.assert_allclose([b.value for b in branch.bifurcations], [24.51657282856, 31.1179020], rtol=1e-8)
     (doubled,) = branch.others
     np.testing.assert_allclose(doubled.periods[1:], 0.8)  # (it begins at the flip)
@@ -79,3 +87,88 @@ def test_an_orbit_that_slides_all_along():
     np.testing.assert_allclose(transition.value, 1.5 * abs(1 + 0.2j - 4), rtol=1e-9)
     assert branch.values[-1] == 6.0 and np.all(branch.stable)
     assert int(branch.orbit(len(branch.values) - 1).events.num) == 4
+
+
+class Relative(NamedTuple):
+    x: Any
+    v: Any
+
+
+class BallInCapsule(nsjax.System):
+    """A ball between the two membranes of an inclined capsule that is shaken: a vibro-impact energy harvester."""
+
+    F: Any = 0.3
+    gravity: Any = 0.1
+    restitution: Any = 0.5
+    length: Any = 0.3
+
+    def vector_field(self, t, y, s):
+        return Relative(y.v, self.F * jnp.cos(jnp.pi * t) + self.gravity + s.bottom - s.top)
+
+    @nsjax.impact
+    def bottom(self, t, y):
+        return y.x + self.length / 2
+
+    @bottom.restitution
+    def bottom(self):
+        return self.restitution
+
+    @nsjax.impact
+    def top(self, t, y):
+        return self.length / 2 - y.x
+
+    @top.restitution
+    def top(self):
+        return self.restitution
+
+    @property
+    def period(self):
+        return 2.0
+
+
+def test_a_name_needs_its_multiplier(buck):
+    """Where a test function changes its sign through a jump, no multiplier is at 1 or -1."""
+    flip = buck.bifurcations[0]
+    spot, curve = flip.origin.spot, flip.origin.curve
+    assert OrbitBifurcation.smooth("flip", "V_in", spot, curve, flip.halves).kind == flip.kind == "flip"
+    away = dataclasses.replace(spot, multipliers=np.array([1.00005, 0.25]))
+    point = OrbitBifurcation.smooth("flip", "V_in", away, curve, flip.halves)
+    assert (point.kind, point.by_crossing, point.by_count, point.evidence) == ("unresolved", (), "flip", "count")
+    assert "unresolved special points within 1e-6" in str(point)
+    for kind in ("fold", "transcritical"):
+        assert OrbitBifurcation.smooth(kind, "V_in", spot, curve, []).kind == "unresolved"
+    with pytest.raises(ValueError, match="unresolved special points within 1e-6.* only the neighbourhood is known"):
+        nsjax.continue_bifurcation(point, "V_in", (18.0, 30.0))
+
+
+def test_the_twins_of_a_symmetry_have_equal_multipliers(buck):
+    spot, curve = buck.bifurcations[0].origin.spot, buck.bifurcations[0].origin.curve
+    at = dataclasses.replace(spot, multipliers=np.array([1.0, 0.25]))
+
+    def half(side, *multipliers):
+        return OrbitHalfBranch(side, 1, np.array(multipliers), abs(multipliers[0]) < 1, "")
+
+    halves = [half(-1, 0.99, 0.25), half(1, 1.01, 0.25), half(1, 0.98, 0.25), half(1, 0.98, 0.25)]
+    point = OrbitBifurcation.smooth("symmetry breaking", "V_in", at, curve, halves)
+    assert (point.kind, point.criticality) == ("symmetry breaking", "supercritical")
+    halves[-1] = half(1, 0.9, 0.27)
+    assert OrbitBifurcation.smooth("symmetry breaking", "V_in", at, curve, halves).kind == "branch point"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_named_points_have_their_multipliers(seed):
+    """Along cascades of a ball in a capsule, beside many grazings."""
+    rng = np.random.default_rng(seed)
+    system = BallInCapsule(
+        *map(jnp.asarray, (0.3, rng.uniform(0.05, 0.2), rng.uniform(0.4, 0.7), rng.uniform(0.2, 0.4)))
+    )
+    settled = nsjax.solve(system, 0.0, 400.0, Relative(0.01, 0.0), throw=False, max_steps=2**16, max_events=2**12)
+    orbit = nsjax.find_orbit(system, settled.y1, order=None)
+    branch = nsjax.continue_orbit(system, orbit, "F", (0.2, 0.5), max_branches=4)
+    smooth = [point for point in branch.special if not point.discontinuous]
+    assert smooth
+    for point in smooth:
+        value = {"flip": -1, "fold": 1, "transcritical": 1, "symmetry breaking": 1, "branch point": 1}.get(point.kind)
+        if value is not None:
+            assert np.min(np.abs(point.multipliers[0] - value)) < 1e-2, point

@@ -227,10 +227,10 @@ def _checked(
             "Argument `special` must come from `continue_orbit` itself, but was loaded from a file, which does not "
             "hold the equations that were solved: call `continue_orbit` again, for a short interval."
         )
-    if origin.test.kind == "guard":
+    if origin.test.kind == "guard" or special.kind == "unresolved":
         raise ValueError(
-            f"Argument `special` must be a zero of an equation, but of this {special.name} at {special.parameter} = "
-            f"{special.value:.10g} only the neighbourhood is known."
+            f"Argument `special` must be a zero of an equation, but at {special.parameter} = {special.value:.10g} "
+            f"({special.name}) only the neighbourhood is known."
         )
     curve = origin.curve
     system = curve.model.system

@@ -19,6 +19,9 @@ from ._tracer import OrbitPoint
 
 SMOOTH = {kind: kind for kind in ("fold", "flip", "Neimark-Sacker")}  # and the test function that tells it
 ONES = ("fold", "symmetry breaking", "transcritical", "branch point", "3 to 1", "1 to 3")
+NEAR = 1e-2  # of 1 or -1: at a fold or branch point, or at a flip, a multiplier is nearer to it
+ROUNDING = 1e-12  # of a multiplier, over the largest
+TWINS = 1e-3  # the relative difference of multipliers of two orbits that are each other's image by a symmetry
 
 
 class Origin(NamedTuple):
@@ -68,7 +71,8 @@ class OrbitBifurcation(AbstractSpecialPoint):
         multipliers cross the circle at both 1 and -1 (section 6.9); "infinitely unstable fold" where one jumps from 0
         to infinity (section 6.7); "multiple crossing", or "3 to 1" (the numbers below and above) for what has no
         name; "none" where the itinerary changes without a bifurcation; "end" where there is no orbit nearby beyond,
-        "continuum" where beyond friction holds every state of a continuum.
+        "continuum" where beyond friction holds every state of a continuum; "unresolved" where a test function changes
+        its sign and no multiplier is at 1 or -1, as between special points that are too close together.
     - `discontinuous`: whether it is a corner: multipliers jump there.
     - `criticality`: "supercritical", "subcritical", or None if the kind knows no such thing.
     - `evidence`: what supports the kind: "count" of the orbits (Definition 5.1), "crossing" of the unit circle by
@@ -88,7 +92,10 @@ class OrbitBifurcation(AbstractSpecialPoint):
     - `origin`: what `continue_bifurcation` sets out from; None at a Hopf bifurcation, or if the point was loaded.
     """
 
-    plain = {"end": "end of the branch", "continuum": "end of the branch in a continuum of orbits"}
+    plain = {
+        "end": "end of the branch", "continuum": "end of the branch in a continuum of orbits",
+        "unresolved": "unresolved special points within 1e-6",
+    }  # fmt: skip
 
     kind: str
     discontinuous: bool
@@ -139,14 +146,20 @@ class OrbitBifurcation(AbstractSpecialPoint):
         alone = kind == "Neimark-Sacker"  # of what is born there nothing is periodic
         if alone:
             below = above = (1,)
+        test = Test(SMOOTH.get(kind, "branch"))
+        if kind == "symmetry breaking" and not _are_images(*_twins(halves)):
+            kind = "branch point"
+        by_count, by_crossing = "none" if alone else kind, (kind,)
+        if not (alone or _has_multiplier(spot.multipliers, -1.0 if kind == "flip" else 1.0, curve.autonomous)):
+            kind, by_crossing = "unresolved", ()
+        evidence = "count" if kind == "unresolved" else "both" if halves else "crossing"
         criticality = None
         born = [h for h in halves if h.laps == 2] if kind == "flip" else _twins(halves)
         if kind in ("flip", "symmetry breaking") and born:
             criticality = "supercritical" if born[0].stable else _criticality(spot, born[0])
         return _made(
             name, spot, curve, kind, (below, above), discontinuous=False, criticality=criticality, halves=halves,
-            evidence="both" if halves else "crossing", by_count="none" if alone else kind, by_crossing=(kind,),
-            origin=Origin(Test(SMOOTH.get(kind, "branch")), spot, curve),
+            evidence=evidence, by_count=by_count, by_crossing=by_crossing, origin=Origin(test, spot, curve),
         )  # fmt: skip
 
     @classmethod
@@ -218,13 +231,26 @@ def _made(
     return OrbitBifurcation(kind=kind, count=count, **(point | twice | given))
 
 
-def _twins(halves: Sequence[OrbitHalfBranch]) -> list[OrbitHalfBranch]:
-    """The two that lie on the side on which there are three."""
-    for side in (-1, 1):
-        here = [h for h in halves if h.side == side]
-        if len(here) == 3:
-            return [h for h in here if sum(h.stable == o.stable for o in here) == 2]
-    return []
+def _has_multiplier(multipliers: np.ndarray, value: float, autonomous: bool) -> bool:
+    """Whether one of them is at 1 or -1, beside the trivial one; True where one of them is not finite."""
+    size = np.abs(multipliers)
+    if not np.isfinite(size).all():
+        return True
+    wanted = 2 if autonomous and value > 0 else 1
+    return int(np.sum(np.abs(multipliers - value) < NEAR + ROUNDING * size.max(initial=0))) >= wanted
+
+
+def _are_images(a: OrbitHalfBranch, b: OrbitHalfBranch) -> bool:
+    """Whether two orbits have the same multipliers, as the images of each other by a symmetry have."""
+    first, second = (np.sort_complex(half.multipliers.astype(complex)) for half in (a, b))
+    return bool(np.allclose(first, second, rtol=TWINS, atol=1e-6))
+
+
+def _twins(halves: Sequence[OrbitHalfBranch]) -> Sequence[OrbitHalfBranch]:
+    """The two that one branch has on the same side of a branch point, of half-branches in pairs that go on into one
+    another."""
+    pairs = (halves[:2], halves[2:])
+    return next((pair for pair in pairs if len(pair) == 2 and pair[0].side == pair[1].side), ())
 
 
 def _criticality(spot: Any, born: OrbitHalfBranch) -> str:
