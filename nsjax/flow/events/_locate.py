@@ -57,7 +57,7 @@ def step_to(te: Scalar, stepper: Stepper, args: tuple) -> tuple[Y, list[Y]]:
 
 def _guard(te: Scalar, y: Y, args: tuple) -> Scalar:
     model, _, _, _, state, slot, part, _ = args
-    return model.stacked(model.guards(te, y, state), -1.0)[slot, part]
+    return model.stacked(model.guards(te, y, state), -jnp.inf)[slot, part]
 
 
 @eqx.filter_custom_jvp
@@ -109,7 +109,7 @@ def locate(model: SwitchedSystem, stepper: Stepper, step: Interval) -> Located:
 
     def field_and_guards(t: Scalar, y: Y) -> tuple[Y, Array]:
         s, f = frozen_model.values_and_flow(t, y, state)
-        return f, model.stacked(frozen_model.guards(t, y, state, s=s), -1.0)
+        return f, model.stacked(frozen_model.guards(t, y, state, s=s), -jnp.inf)
 
     # A multiplier that stays at its bound, or a guard which begins with a double root, has no sign if it does not rise
     # above rounding on the whole step.
@@ -196,7 +196,7 @@ def encounter(
 
     def guards_and_field(t: Scalar, x: Array) -> tuple[Float[Array, " slots"], Array]:
         s, f = model.values_and_flow(t, unravel(x), state)
-        rows = model.stacked(model.guards(t, unravel(x), state, s=s), -1.0)
+        rows = model.stacked(model.guards(t, unravel(x), state, s=s), -jnp.inf)
         return rows[np.arange(len(model.slots)), part], jfu.ravel_pytree(f)[0]
 
     rtol, atol = tolerance
