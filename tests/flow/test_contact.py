@@ -550,21 +550,26 @@ def released(F):
     return 1 - F * (jnp.sin(4.0) - jnp.sin(begin)) + F * jnp.cos(begin) * since + since**2 / 2
 
 
+def pressed(F, x, v, solver=None):
+    sol = solve(Pressed(F), 0.0, 4.0, Motion(x, v), solver=solver, rtol=1e-10, atol=1e-10)
+    return sol.y1.x, sol
+
+
 @pytest.mark.parametrize("solver", [None, nsjax.Taylor()])
 def test_friction_along_the_normal_of_a_contact(solver):
-    """Issue 59.B4: the contact bears the load while it rests, and friction holds the mass when it has opened."""
-
-    def end(F):
-        return solve(Pressed(F), 0.0, 4.0, Motion(1.0, 0.0), solver=solver, rtol=1e-10, atol=1e-10)
-
-    sol = end(3.0)
+    """The contact bears the load while it rests, and friction holds the mass when it has opened."""
+    run = jax.jit(lambda *at: jax.jacfwd(pressed, has_aux=True)(*at, solver))
+    slope, sol = run(3.0, 1.0, 0.0)
     np.testing.assert_allclose(sol.events.t[: int(sol.events.num)], [np.pi, np.pi + np.arcsin(1 / 3)], rtol=1e-9)
     np.testing.assert_allclose(sol.y1.x, 0.938126445, rtol=1e-9)
-    np.testing.assert_allclose(jax.jacfwd(lambda F: end(F).y1.x)(3.0), jax.grad(released)(3.0), rtol=1e-7)
-    swept = nsjax.sweep(lambda F: end(F).y1.x, jnp.asarray([2.0, 3.0]))
-    np.testing.assert_allclose(swept, jax.vmap(released)(jnp.asarray([2.0, 3.0])), rtol=1e-8)
-    thrown = solve(Pressed(), 0.0, 4.0, Motion(0.9, 0.8), solver=solver, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(slope, jax.grad(released)(3.0), rtol=1e-7)
+    thrown = run(3.0, 0.9, 0.8)[1]
     np.testing.assert_allclose(thrown.y1.x, sol.y1.x, rtol=1e-9)
+
+
+def test_friction_along_the_normal_of_a_contact_in_a_sweep():
+    swept = nsjax.sweep(lambda F: pressed(F, 1.0, 0.0)[0], jnp.asarray([2.0, 3.0]))
+    np.testing.assert_allclose(swept, jax.vmap(released)(jnp.asarray([2.0, 3.0])), rtol=1e-8)
 
 
 def test_friction_beside_a_stop_on_a_moving_belt():

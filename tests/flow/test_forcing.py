@@ -492,15 +492,28 @@ class ClockedSquareWave(SquareWave):
         return (SquareWave.friction, ClockedSquareWave.tick)
 
 
-def test_orbits_of_a_square_wave_need_no_clock():
-    """But branches do, and say so."""
-    orbit, clocked = (nsjax.find_orbit(m, Motion(0.0, 0.0), order=1) for m in (SquareWave(), ClockedSquareWave()))
-    np.testing.assert_allclose(orbit.y0, clocked.y0, atol=1e-10)
-    np.testing.assert_allclose(orbit.multipliers, clocked.multipliers, atol=1e-10)
-    phi, clocked_phi = (nsjax.fundamental_matrix(o.system, 0.0, 2.0, orbit.y0) for o in (orbit, clocked))
-    np.testing.assert_allclose(phi, clocked_phi, atol=1e-10)
+@pytest.fixture(scope="module")
+def square_orbit():
+    return nsjax.find_orbit(SquareWave(), Motion(0.0, 0.0), order=1)
+
+
+def test_branches_of_a_square_wave_need_a_clock(square_orbit):
     with pytest.raises(ValueError, match="`SquareWave` jumps .* declare them as ticks of a `nsjax.clock`"):
-        nsjax.continue_orbit(SquareWave(), orbit, "T", (1.8, 2.2))
+        nsjax.continue_orbit(SquareWave(), square_orbit, "T", (1.8, 2.2))
+
+
+def test_orbits_of_a_square_wave_need_no_clock(square_orbit):
+    phi = jax.jit(lambda y0: nsjax.fundamental_matrix(SquareWave(), 0.0, 2.0, y0))(square_orbit.y0)
+    np.testing.assert_allclose(phi, square_orbit.monodromy, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_orbits_of_a_square_wave_with_and_without_a_clock(square_orbit):
+    orbit = nsjax.find_orbit(ClockedSquareWave(), Motion(0.0, 0.0), order=1)
+    np.testing.assert_allclose(square_orbit.y0, orbit.y0, atol=1e-10)
+    np.testing.assert_allclose(square_orbit.multipliers, orbit.multipliers, atol=1e-10)
+    phi = nsjax.fundamental_matrix(orbit.system, 0.0, 2.0, orbit.y0)
+    np.testing.assert_allclose(phi, orbit.monodromy, atol=1e-7)
 
 
 def test_a_period_that_is_not_the_period_of_the_forcing():
