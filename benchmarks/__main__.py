@@ -15,6 +15,7 @@ HERE = pathlib.Path(__file__).parent
 RUNS = (
     ("sweep.py", "--out", "sweep.json"),
     ("stops.py", "--rounds", "5", "--out", "stops.json"),
+    ("friction.py", "--out", "friction.json"),
     ("cost.py", "--out", "cost.json"),
     ("first_answer.py", "--out", "first_answer.json"),
     ("growth.py", "--repeats", "3", "--out", "growth"),

@@ -13,6 +13,7 @@ FOLDER = pathlib.Path(__file__).parents[2] / "benchmarks"
 SMALL = {
     "sweep.py": "--workload S1 --lanes 8 --scipy-lanes 1 --rounds 1",
     "stops.py": "--lanes 16 --rounds 1",
+    "friction.py": "--lanes 16 --rounds 1 --sweep 6.8",
     "cost.py": "--lanes 4 --repeats 1",
     "first_answer.py": "--repeats 1 --rows",
     "growth.py": "--panels events --repeats 1",
@@ -32,7 +33,7 @@ def test_all_are_known():
 @pytest.mark.slow
 @pytest.mark.parametrize("script", SMALL)
 def test_it_runs(script, tmp_path):
-    if script == "sweep.py":
+    if script in ("sweep.py", "friction.py"):
         pytest.importorskip("heyoka")
     out = tmp_path / ("found" if script in ("growth.py", "work_precision.py") else "found.json")
     rows = ROWS if script == "first_answer.py" else ()
