@@ -93,3 +93,26 @@ def test_saltation_at_a_tangency_is_infinite():
     start = Motion(jnp.asarray(1.0), jnp.asarray(0.0))
     matrix = jax.jit(lambda y: nsjax.saltation_matrix(Push(), 0.0, y, "wall", 1, -1, throw=False))(start)
     np.testing.assert_array_equal(matrix, [[1, 0], [np.inf, 1]])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", ["swept", dfx.Tsit5(), dfx.Dopri8(), nsjax.Taylor()])
+def test_uncertain_derivatives_say_so(solver):
+    """At the default tolerance, from clear impacts to touches: where the derivative is off by a tenth, the status or the
+    margin says so."""
+
+    def end(gap):
+        how = {} if solver == "swept" else dict(solver=solver)
+        sol = solve(Touch(gap), -np.pi, 3.0, Motion(-1.0, 0.0), throw=False, **how)
+        return jnp.stack(sol.y1), (sol.result, sol.margin)
+
+    gaps = -(10.0 ** np.random.default_rng(0).uniform(-13, -2, 500))
+    slope = jax.jacfwd(end, has_aux=True)
+    found, (result, margin) = (
+        nsjax.sweep(slope, jnp.asarray(gaps)) if solver == "swept" else jax.jit(jax.vmap(slope))(gaps)
+    )
+    want = jax.vmap(jax.jacfwd(impact))(jnp.asarray(gaps))
+    off = np.max(np.abs(np.asarray(found - want)), axis=1) > 0.1 * np.max(np.abs(np.asarray(want)), axis=1)
+    told = np.asarray(result != RESULTS.successful) | (np.asarray(margin) < 100)
+    assert off.any() and not (off & ~told).any(), gaps[off & ~told]
+    assert np.mean(told[gaps < -1e-4]) == 0
