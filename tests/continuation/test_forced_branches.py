@@ -9,6 +9,7 @@ import pytest
 
 import nsjax
 from nsjax.continuation.orbits._bifurcation import OrbitBifurcation, OrbitHalfBranch
+from nsjax.maps._corner_normal_form import CornerKind
 
 
 class Current(NamedTuple):
@@ -172,3 +173,18 @@ def test_named_points_have_their_multipliers(seed):
         value = {"flip": -1, "fold": 1, "transcritical": 1, "symmetry breaking": 1, "branch point": 1}.get(point.kind)
         if value is not None:
             assert np.min(np.abs(point.multipliers[0] - value)) < 1e-2, point
+
+
+def test_a_corner_in_doubt_is_named_if_all_its_orbits_are_there(buck):
+    spot, curve = buck.bifurcations[0].origin.spot, buck.bifurcations[0].origin.curve
+
+    def kind(certain, sides):
+        halves = [OrbitHalfBranch(side, 1, np.array([0.5, 0.25]), True, "") for side in sides]
+        found = CornerKind("fold", None, (1, 1), (), certain)
+        return OrbitBifurcation.corner(
+            "V_in", spot, curve, halves, found, None, surfaces=("comparator",),
+            monodromies=(spot.monodromy,) * 2, multipliers=(spot.multipliers,) * 2, transition=None,
+        ).kind  # fmt: skip
+
+    assert kind(True, [-1]) == kind(False, [-1, -1]) == "fold"
+    assert kind(False, [-1]) == kind(False, [-1, 1]) == "unresolved"

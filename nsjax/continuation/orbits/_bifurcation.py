@@ -72,7 +72,8 @@ class OrbitBifurcation(AbstractSpecialPoint):
         to infinity (section 6.7); "multiple crossing", or "3 to 1" (the numbers below and above) for what has no
         name; "none" where the itinerary changes without a bifurcation; "end" where there is no orbit nearby beyond,
         "continuum" where beyond friction holds every state of a continuum; "unresolved" where a test function changes
-        its sign and no multiplier is at 1 or -1, as between special points that are too close together.
+        its sign and no multiplier is at 1 or -1, as between special points that are too close together, and at a corner
+        whose normal form is in doubt if not all orbits that it foretells are there.
     - `discontinuous`: whether it is a corner: multipliers jump there.
     - `criticality`: "supercritical", "subcritical", or None if the kind knows no such thing.
     - `evidence`: what supports the kind: "count" of the orbits (Definition 5.1), "crossing" of the unit circle by
@@ -172,6 +173,9 @@ class OrbitBifurcation(AbstractSpecialPoint):
         names = {"+1": "fold", "-1": "flip", "pair": "Neimark-Sacker"}
         by_crossing = None if crossings is None else tuple(names[c.kind] for c in crossings)
         kind, evidence = by_count.kind, "count"
+        entered = tuple(tuple(sorted(h.laps for h in halves if h.side == side)) for side in (-1, 1))
+        if not by_count.certain and entered != (tuple(sorted(by_count.below)), tuple(sorted(by_count.above))):
+            kind = "unresolved"
         if by_crossing is not None:
             expected = {
                 "none": [], "fold": ["fold"], "flip": ["flip"], "fold-flip": ["flip", "fold"],
