@@ -175,6 +175,43 @@ def test_each_switch_adds_and_does_not_multiply():
     assert counts[1] < 2 * counts[0] and counts[3] < 1.5 * counts[2]
 
 
+class Row(nsjax.System):
+    """Bodies in a row, each with a stop at the one before it."""
+
+    number: int = 2
+
+    def vector_field(self, t, y, s):
+        forces = jnp.stack([s[f"gap{i}"] for i in range(self.number)])
+        return Motion(y.v, -1.0 + forces - jnp.append(forces[1:], 0.0))
+
+    @property
+    def switches(self):
+        return _gaps(self.number)
+
+
+@functools.cache  # switches are told apart by identity
+def _gaps(number):
+    def gap(i):
+        switch = nsjax.impact(lambda self, t, y: y.x[i] - (y.x[i - 1] if i else 0.0), name=f"gap{i}")
+        return switch.restitution(lambda self: 0.6)
+
+    return tuple(map(gap, range(number)))
+
+
+@pytest.mark.slow
+def test_programs_of_contacts_grow_with_their_number():
+    """Twice as many make half as much more of a program. (What an impact leads to was traced for each contact with all
+    others inside, so that a chain of eleven did not end.)"""
+
+    def equations(n):
+        y = Motion(jnp.arange(1.0, n + 1), jnp.zeros(n))
+        flow = jax.make_jaxpr(lambda y: solve(Row(n), 0.0, 1.0, y, throw=False).y1)(y)
+        return sum(1 for _ in equations_of(flow.jaxpr))
+
+    few, many = equations(6), equations(12)
+    assert many < 1.6 * few, (few, many)
+
+
 def test_multipliers_are_not_taken_to_jump():
     """Comparisons in the linear system for several multipliers are none of the model's: nothing looks for a jump in
     time, which took a quarter of such a program."""
