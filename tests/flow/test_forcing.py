@@ -1,7 +1,6 @@
 """Forcing as users write it: windows, tables, square waves, several frequencies; against closed forms."""
 
 import functools
-from typing import NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -10,14 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import Array
+from sliding import Stribeck
 
 import nsjax
 from nsjax import RESULTS
-
-
-class Motion(NamedTuple):
-    x: Array | float
-    v: Array | float
+from nsjax.gallery import Motion
 
 
 SOLVERS = {"Tsit5": dfx.Tsit5(), "Dopri8": dfx.Dopri8(), "Taylor": nsjax.Taylor(), "Exponential": nsjax.Exponential()}
@@ -227,24 +223,6 @@ def test_two_frequencies_beside_a_static_load():
         return nsjax.solve(Loaded(load), 0.0, 200.0, Motion(load, 0 * load), throw=False).y1.x - load
 
     np.testing.assert_allclose(nsjax.sweep(end, loads), -0.08891, atol=2e-5)
-
-
-class Stribeck(nsjax.System):
-    """A pendulum on a belt whose friction falls with |v_rel|, shaken."""
-
-    mu: Array | float = 0.2898
-    delta: Array | float = 1.8297
-    v_b: Array | float = 0.09053
-    F: Array | float = 1.0971
-    omega: Array | float = 2.29
-
-    def vector_field(self, t, y, s):
-        friction = self.mu * s.belt / (1 + self.delta * jnp.abs(y.v - self.v_b))
-        return Motion(y.v, -jnp.sin(y.x) + self.F * jnp.cos(self.omega * t) - friction)
-
-    @nsjax.sgn
-    def belt(self, t, y):
-        return y.v - self.v_b
 
 
 def test_friction_in_the_sliding_velocity_is_caught_where_it_should_be():

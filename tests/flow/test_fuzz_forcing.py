@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import Array
-from sliding import SlidingMass
+from sliding import SlidingMass, Stribeck
 
 import nsjax
 from nsjax import RESULTS
@@ -197,21 +197,6 @@ def test_random_derivatives_by_an_amplitude_of_zero(solver):
     np.testing.assert_allclose(slopes, want, atol=1e-4, rtol=1e-4)
 
 
-class Stribeck(nsjax.System):
-    """A pendulum that a belt drags along, with friction that falls with |v_rel|, and a forcing."""
-
-    p: Array  # of friction, its fall, belt, force and frequency
-
-    def vector_field(self, t, y, s):
-        mu, delta, belt, force, omega = self.p
-        friction = mu / (1 + delta * jnp.abs(y.v - belt)) * s.belt
-        return Motion(y.v, force * jnp.cos(omega * t) - jnp.sin(y.x) - friction)
-
-    @nsjax.sgn
-    def belt(self, t, y):
-        return y.v - self.p[2]
-
-
 LATE = 15.0
 
 
@@ -242,7 +227,7 @@ def test_random_friction_in_the_sliding_velocity(solver):
     @jax.vmap
     def end(p, start):
         how = dict(solver=solver, rtol=1e-10, atol=1e-10, throw=False)
-        sol = nsjax.solve(Stribeck(p), 0.0, LATE, Motion(start[0], start[1]), **how)
+        sol = nsjax.solve(Stribeck(*p), 0.0, LATE, Motion(start[0], start[1]), **how)
         return jnp.stack(sol.y1), sol.result == RESULTS.successful
 
     y1, fine = end(jnp.asarray(numbers), jnp.asarray(starts))

@@ -1,12 +1,35 @@
-"""A mass on a belt, with friction and a wall, by scipy: from one change of mode to the next."""
+"""A pendulum on a belt, and a mass on a belt with friction and a wall by scipy, from one change of mode to the next."""
 
 import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+
+import nsjax
+from nsjax.gallery import Motion
+
+
+class Stribeck(nsjax.System):
+    """A pendulum on a belt whose friction falls with |v_rel|, shaken."""
+
+    mu: Array | float = 0.2898
+    delta: Array | float = 1.8297
+    v_b: Array | float = 0.09053
+    F: Array | float = 1.0971
+    omega: Array | float = 2.29
+
+    def vector_field(self, t, y, s):
+        friction = self.mu * s.belt / (1 + self.delta * jnp.abs(y.v - self.v_b))
+        return Motion(y.v, -jnp.sin(y.x) + self.F * jnp.cos(self.omega * t) - friction)
+
+    @nsjax.sgn
+    def belt(self, t, y):
+        return y.v - self.v_b
 
 
 @dataclasses.dataclass
