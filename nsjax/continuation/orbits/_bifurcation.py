@@ -19,8 +19,8 @@ from ._tracer import OrbitPoint
 
 SMOOTH = {kind: kind for kind in ("fold", "flip", "Neimark-Sacker")}  # and the test function that tells it
 ONES = ("fold", "symmetry breaking", "transcritical", "branch point", "3 to 1", "1 to 3")
-# At a fold or a branch point a multiplier is nearer to 1 than this, at a flip to -1. (Where two coincide, as at a fold of
-# autonomous orbits, they are known to the root of the error of the matrix only.)
+# At a fold or a branch point a multiplier is nearer to 1 than this, at a flip to -1. (Two that coincide, as at a fold
+# of autonomous orbits, are known to the root of the error of the matrix only.)
 NEAR = 1e-2
 ROUNDING = 1e-12  # of a multiplier, over the largest
 TWINS = 1e-3  # the relative difference of multipliers of two orbits that are each other's image by a symmetry
