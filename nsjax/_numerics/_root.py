@@ -15,26 +15,37 @@ from ._autodiff import dense_jacobian, frozen
 from ._select import select
 
 
+class Sizes(NamedTuple):
+    """The units in which Newton's method measures its unknowns and its equations, as they are flattened by
+    `ravel_pytree`: each a vector, or one number for all."""
+
+    unknowns: Any = 1.0
+    equations: Any = 1.0
+
+
 class Newton(NamedTuple):
     """When Newton's method ends."""
 
-    tol: Any  # relative and absolute, of the unknowns
+    tol: Any  # relative and absolute, of the unknowns; absolute, of the equations
     max_steps: int
 
     def solver(self, well_posed: bool | None = None) -> optx.Newton:
         return optx.Newton(rtol=self.tol, atol=self.tol, linear_solver=lx.AutoLinearSolver(well_posed=well_posed))
 
-    def step(self, z: Array, residual: Array, jacobian: Array) -> tuple[Array, Bool[Array, ""], Bool[Array, ""]]:
+    def step(
+        self, z: Array, residual: Array, jacobian: Array, sizes: Sizes = Sizes()
+    ) -> tuple[Array, Bool[Array, ""], Bool[Array, ""]]:
         """One step of `find_root`, where residual and Jacobian are known: where it leads, whether the search ends
         there, and whether it has converged."""
 
-        def linear(x: Array, _: Any) -> tuple[Array, None]:
-            return residual + jacobian @ (x - z), None
+        def linear(w: Array, _: Any) -> tuple[Array, None]:
+            return (residual + jacobian @ (w * sizes.unknowns - z)) / sizes.equations, None
 
-        solver = self.solver()
-        state = solver.init(linear, z, None, {}, jax.eval_shape(lambda: residual), None, frozenset())
-        new, state, _ = solver.step(linear, z, None, {}, state, frozenset())
-        ended, result = solver.terminate(linear, new, None, {}, state, frozenset())
+        solver, w = self.solver(), z / sizes.unknowns
+        state = solver.init(linear, w, None, {}, jax.eval_shape(lambda: residual), None, frozenset())
+        w, state, _ = solver.step(linear, w, None, {}, state, frozenset())
+        ended, result = solver.terminate(linear, w, None, {}, state, frozenset())
+        new = w * sizes.unknowns
         finite = jnp.all(jnp.isfinite(new))
         return new, ended | ~finite, ended & finite & (result == optx.RESULTS.successful)
 
@@ -45,29 +56,35 @@ def find_root(
     parameters: Any,
     newton: Newton,
     *,
+    sizes: Sizes = Sizes(),
     well_posed: bool | None = None,
 ) -> tuple[Any, Bool[Array, ""]]:
     """A root of `residual(z, parameters)` by optimistix's Newton method, and whether it converged.
+
+    Optimistix compares the residual with the absolute tolerance alone, and a component of z that is near zero too:
+    without `sizes` rounding alone keeps a search among numbers of 1e9 from ending.
 
     The root's derivatives with respect to the parameters, of every order, are those of the implicit function. They are
     NaN where there is no root, or where it is not regular: optimistix's own rule raises an error there, which
     one bad lane of a batch would do for all. Where roots may not be isolated (`well_posed=False`) the steps are the
     shortest ones.
     """
+    begin, unravel = jfu.ravel_pytree(frozen(guess))
+    unknowns, equations = frozen(sizes)
+
+    def flat(z: Array, parameters: Any) -> Array:
+        return jfu.ravel_pytree(residual(unravel(z), parameters))[0]
+
     found = optx.root_find(
-        lambda z, p: dense_jacobian(residual, z, p),
+        lambda w, p: dense_jacobian(flat, w * unknowns, p) / equations,
         newton.solver(well_posed),
-        frozen(guess),
+        begin / unknowns,
         args=frozen(parameters),
         max_steps=newton.max_steps,
         throw=False,
     )
     converged = found.result == optx.RESULTS.successful
-    z, unravel = jfu.ravel_pytree(frozen(found.value))
-
-    def flat(z: Array, parameters: Any) -> Array:
-        return jfu.ravel_pytree(residual(unravel(z), parameters))[0]
-
+    z = frozen(found.value) * unknowns
     return unravel(_implicit(z, eqx.filter_closure_convert(flat, z, parameters), parameters, converged)), converged
 
 

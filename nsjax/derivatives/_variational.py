@@ -9,13 +9,14 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._numerics._autodiff import frozen
 from .._numerics._compile import interactive
 from .._numerics._select import select
 from .._types import Scalar, Y
 from ..flow._arguments import checked_start, checked_time
 from ..flow._integrator import Integrator
 from ..flow._mode_flow import VariedModeFlow
-from ..flow._results import raise_if, RESULTS
+from ..flow._results import is_okay, raise_if, RESULTS
 from ..flow._solution import Solution
 from ..flow._solve import integrate, solve
 from ..system._model import SwitchedSystem
@@ -173,16 +174,22 @@ def _by_arcs(
     def matrix(columns: Y) -> Array:
         return jax.vmap(lambda column: jfu.ravel_pytree(column)[0], out_axes=1)(columns)
 
+    rows, first = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(state), model.state_at(t0, y0, tuple(sol.mode0))
+    largest = jnp.max(select(jnp.isfinite(rows), jnp.abs(rows), 0), axis=0)
+    sizes = frozen(integrator.sizes_of(largest, jfu.ravel_pytree(model.flow(t0, y0, first))[0], sol.t1 - t0))
+    relative, jumps = integrator.in_sizes(flat.dtype), jumps * sizes / sizes[:, None]
+
     def arc(phi: Array, a: Scalar, b: Scalar, y: Y, mode: Array, jump: Array) -> tuple[Array, Array]:
-        smooth = VariedModeFlow(model, model.state_at(a, y, tuple(mode)))
+        smooth = VariedModeFlow(model, model.state_at(a, y, tuple(mode)), unravel(sizes))
         # On an arc that runs backwards so do the times.
         low, high = jnp.minimum(a, b), jnp.maximum(a, b)
         inside = jnp.clip(times, low, high)
         order = jnp.argsort(select(b >= a, inside, -inside))
-        varied = y, jax.vmap(unravel, in_axes=1)(jump @ phi)
-        out = integrate(smooth, a, b, varied, integrator, saveat=dfx.SaveAt(ts=inside[order]))
-        along = jax.vmap(matrix)(out.ys[1])
-        return matrix(out.y1[1]), jnp.zeros_like(along).at[order].set(along)
+        varied = unravel(jfu.ravel_pytree(y)[0] / sizes), jax.vmap(unravel, in_axes=1)(jump @ phi)
+        out = integrate(smooth, a, b, varied, relative, saveat=dfx.SaveAt(ts=inside[order]))
+        done, along = is_okay(out.result), jax.vmap(matrix)(out.ys[1])
+        along = jnp.zeros_like(along).at[order].set(along)
+        return select(done, matrix(out.y1[1]), jnp.nan), select(done, along, jnp.nan)
 
     none = jnp.zeros((len(times), n, n), flat.dtype)
 
@@ -194,4 +201,5 @@ def _by_arcs(
     # Each time belongs to the arc that ends at or after it; the first one wins, so that Φ is that before a jump.
     sign = select(sol.t1 >= t0, 1, -1)
     index = jnp.clip(jnp.searchsorted(sign * end, sign * times, side="left"), 0, sol.events.num)
-    return whole, by_arc[index, jnp.arange(len(times))]
+    both = whole, by_arc[index, jnp.arange(len(times))]
+    return jax.tree.map(lambda phi: phi * sizes[:, None] / sizes, both)

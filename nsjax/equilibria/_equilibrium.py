@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from .._numerics._autodiff import frozen
 from .._numerics._compile import interactive
 from .._numerics._root import find_root, Newton
+from .._numerics._scaling import equilibrated, sizes_near
 from .._numerics._select import select
 from .._numerics._text import listed, shown
 from .._types import Scalar, StateT, Y
@@ -129,20 +130,32 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, newton: Newton
     begin, signs = model.values(t, y0, state), model.signs(t, state)
     sigma = [select(jnp.isfinite(begin[k]), begin[k], signs[k]) for k in holdable]
     sigma = jnp.stack(sigma) if sigma else jnp.zeros(0, t.dtype)
-    z, converged = find_root(residual, frozen((x0, sigma)), system, newton, well_posed=False)
-    still = frozen(z)
-    error = jnp.max(jnp.abs(residual(still, frozen(system))))
-    whole = jax.jacfwd(lambda z: residual(jfu.ravel_pytree(still)[1](z), frozen(system)))
-    singular = jnp.linalg.svd(whole(jfu.ravel_pytree(still)[0]), compute_uv=False)
+    start, unflatten = jfu.ravel_pytree(frozen((x0, sigma)))
+
+    def flat(z: Array) -> Array:
+        return residual(unflatten(z), frozen(system))
+
+    sizes = sizes_near(jax.jacfwd(flat)(start), start)
+    sizes = sizes._replace(equations=select(sizes.equations > 0, sizes.equations, 1))
+    z, converged = find_root(residual, (x0, sigma), system, newton, sizes=sizes, well_posed=False)
+    end = jfu.ravel_pytree(frozen(z))[0]
+    error, matrix = flat(end), jax.jacfwd(flat)(end)
+    sizes = sizes_near(matrix, jnp.maximum(jnp.abs(start), jnp.abs(end)))
+    rows, columns = equilibrated(matrix)
+    left, singular, right = jnp.linalg.svd(rows[:, None] * matrix * columns)
     isolated = singular[-1] > 1e-10 * singular[0]
+    # Among large numbers rounding keeps Newton's method from ending. (The steps are the shortest ones here, too.)
+    inverse = select(singular > 1e-10 * singular[0], 1 / singular, 0)
+    step = columns * (right.T @ (inverse * (left.T @ (rows * error))))
+    small = 1e3 * newton.tol
+    ended = converged | jnp.all(jnp.abs(step) <= small * sizes.unknowns)
+    good = ended & jnp.all(jnp.abs(error) <= small * sizes.equations)
 
     live = model.with_system(system)
     y, s = unravel(z[0]), switch_values(live, t, state, z[1])
     jacobian, motion, held, attracts = linear_motion(live, t, y, state, s)
     roots = free_eigenvalues(motion, held)
-    admissible, boundary = _place(model, t, frozen(y), state, frozen(s))
-    size = 1 + jnp.max(jnp.abs(z[0]))
-    good = converged & (error <= 1e3 * newton.tol * size)
+    admissible, boundary = _place(model, t, frozen(y), state, frozen(s), sizes.unknowns)
     return Equilibrium(
         system=system,
         y=y,
@@ -155,7 +168,7 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, newton: Newton
         admissible=admissible,
         boundary=boundary,
         isolated=isolated,
-        residual=error,
+        residual=jnp.max(jnp.abs(error)),
         result=RESULTS.where(good, RESULTS.successful, RESULTS.equilibrium_not_found),
     )
 
@@ -214,17 +227,24 @@ def _free(n: int, held: Int[Array, ""]) -> Bool[Array, " n"]:
 
 
 def _place(
-    model: SwitchedSystem, t: Scalar, y: Y, state: ModeState, s: tuple
+    model: SwitchedSystem, t: Scalar, y: Y, state: ModeState, s: tuple, sizes: Array
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether the state lies where its mode does, and whether on a surface that does not hold it."""
+    """Whether the state lies where its mode does, and whether on a surface that does not hold it. `sizes` are those of
+    the state and of the values of the surfaces."""
     admissible, boundary = jnp.ones((), bool), jnp.zeros((), bool)
+    x, unravel = jfu.ravel_pytree(y)
+    size, forces = unravel(sizes[: len(x)]), dict(zip(model.holdable, sizes[len(x) :]))
     for k, switch in enumerate(model.switches):
         mode = state.mode[k]
         if isinstance(switch, relay):
             admissible = admissible & (switch.rising(model.system, t, y, mode) <= 0)
             continue
-        parts = jnp.stack(model.h(k, t, y))
-        h, slack = jnp.min(parts), 1e3 * jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y)) + 1e-9
+
+        def surface(t: Scalar, y: Y, k: int = k) -> list[Scalar]:
+            return model.h(k, t, y)
+
+        h, slack = jnp.min(jnp.stack(surface(t, y))), jnp.max(model.sizes(surface, t, y, jnp.zeros_like(t), size))
+        slack = 1e-9 * slack + 1e3 * jnp.max(model.rounding(surface, t, y))
         on = jnp.abs(h) <= slack
         if model.conditional(k):
             absent, off = model.absent(k, state.mode), mode == OFF
@@ -234,7 +254,7 @@ def _place(
             admissible, boundary = admissible & side, boundary | on
             continue
         held = model.held(k, mode)
-        within = s[k] >= -1e-9 if k in model.contacts else jnp.abs(s[k]) <= model.bound(k) * (1 + 1e-9)
+        within = s[k] >= -1e-9 * forces[k] if k in model.contacts else jnp.abs(s[k]) <= model.bound(k) * (1 + 1e-9)
         admissible = admissible & select(held, within & (h >= -slack), side)
         boundary = boundary | (on & ~held)
     return admissible, boundary

@@ -105,9 +105,11 @@ def find_equilibria(
     model = SwitchedSystem.forwards(system, t, first)
     found = _in_all_modes(system, model, t, starts, given, Newton(tol, max_steps))
     distinct: list[Equilibrium] = []
+    rows = [np.asarray(ravel(one.y)) for one in found] + list(np.asarray(jax.vmap(ravel)(starts)))
+    size = np.max(np.abs(rows), axis=0)
+    size = np.where(size > 1e-12 * size.max(), size, size.max())  # what is smaller is rounding
     for one in sorted(found, key=lambda one: (not one.admissible, bool(one.boundary))):
-        size = 1 + float(jnp.max(jnp.abs(ravel(one.y))))
-        same = any(jnp.max(jnp.abs(ravel(one.y) - ravel(other.y))) <= 1e-8 * size for other in distinct)
+        same = any(np.all(np.abs(ravel(one.y) - ravel(other.y)) <= 1e-8 * size) for other in distinct)
         if not same and (virtual or one.admissible):
             distinct.append(one)
     return distinct

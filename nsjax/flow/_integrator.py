@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from diffrax._root_finder import use_stepsize_tol
 from jax.core import Tracer
@@ -70,6 +71,35 @@ class Integrator(NamedTuple):
         """Whether a first pass may take the exact flow of affine models."""
         taken = self.open or isinstance(self.solver, Affine)
         return is_first_pass() and taken and isinstance(self.adjoint, dfx.ForwardMode)
+
+    def smallest_size(self, dtype: Any) -> Any:
+        """Returns the size below which states of an orbit count as zero: 1 in the unit of the state, unless an `atol`
+        below the default of `find_orbit`, 1e-12 (float32: 1e-6), says that states are small. It is never zero."""
+        default, least = 1e-12 if jnp.finfo(dtype).eps < 1e-10 else 1e-6, float(jnp.finfo(dtype).tiny)
+        given = jax.tree.leaves(getattr(self.stepsize_controller, "atol", default))  # one for each leaf of the state?
+        if all(isinstance(atol, float | int) for atol in given):
+            return min(max(min(given) / default, least), 1.0)
+        return jnp.clip(jnp.min(jnp.stack([jnp.min(atol) for atol in given])) / default, least, 1)
+
+    def sizes_at(self, x: Any, field: Any, span: Any) -> Any:
+        """Returns a bound of the size of each component of the state along a solution of length `span`, from a state x
+        and the field there."""
+        return jnp.maximum(jnp.maximum(jnp.abs(x), jnp.abs(field * span)), self.smallest_size(x.dtype))
+
+    def sizes_of(self, x: Any, field: Any, span: Any) -> Any:
+        """Returns the size of each component of the state along a solution of length `span`, from the largest absolute
+        values x of some of its states; where these are all zero, from the field at one of them."""
+        small = x <= 1e-6 * jnp.abs(field * span)
+        return jnp.where(small, self.sizes_at(x, field, span), jnp.maximum(x, self.smallest_size(x.dtype)))
+
+    def in_sizes(self, dtype: Any) -> "Integrator":
+        """The same for a state that is measured in its sizes."""
+        controller = self.stepsize_controller
+        if not hasattr(controller, "atol"):
+            return self
+        smallest = self.smallest_size(dtype)
+        atol = jax.tree.map(lambda atol: atol / smallest, controller.atol)
+        return self._replace(stepsize_controller=eqx.tree_at(lambda c: c.atol, controller, atol))
 
     def with_arrays(self, dtype: Any) -> "Integrator":
         """The same with tolerances that are arrays, so that a new one is no new program."""

@@ -4,6 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
 from .._types import Scalar, Y
 from ..system._mode import ModeState
@@ -12,17 +13,26 @@ from ..system._system import System
 
 
 class ModeFlow(System):
-    """y' = f(t, y) in one mode."""
+    """y' = f(t, y) in one mode; with `sizes`, of the structure of the state, that of the state measured in these."""
 
     model: SwitchedSystem
     state: ModeState
+    sizes: Any = None
 
     @property
     def jumps_in_time(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         return "ignored" if self.model.clocks else "missed"  # ticks are events, at which its arcs end
 
     def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
-        return self.model.flow(t, y, self.state)
+        return self.field(self.model, t, y)
+
+    def field(self, model: SwitchedSystem, t: Scalar, y: Y) -> Y:
+        """The field of a model in this mode."""
+        if self.sizes is None:
+            return model.flow(t, y, self.state)
+        return jax.tree.map(
+            jnp.divide, model.flow(t, jax.tree.map(jnp.multiply, y, self.sizes), self.state), self.sizes
+        )
 
 
 class VariedModeFlow(ModeFlow):
@@ -38,7 +48,7 @@ class VariedModeFlow(ModeFlow):
         changed, still = eqx.partition(self.model, jax.tree.map(_is_array, moved, is_leaf=_is_none))
 
         def rhs(y: Y, changed: Any) -> Y:
-            return eqx.combine(changed, still).flow(t, y, self.state)
+            return self.field(eqx.combine(changed, still), t, y)
 
         def change(dy: Y, moved: Any) -> Y:
             return jax.jvp(rhs, (y, changed), (dy, moved))[1]

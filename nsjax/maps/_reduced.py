@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._numerics._compile import interactive
-from .._numerics._root import find_root, Newton
+from .._numerics._root import find_root, Newton, Sizes
 from .._numerics._select import select
 from .._numerics._text import between, shown, written
 from .._types import Scalar, Y
@@ -18,6 +18,9 @@ from ..flow._arguments import checked_start
 from ..flow._integrator import Integrator
 from ..flow._results import is_okay, outcomes, raise_if, RESULTS
 from ..flow._solve import integrate
+from ..orbits._guess import at_start
+from ..orbits._orbit import ravel
+from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, System
 from ._iterate import unless_failed
 from ._stroboscopic import phase_map
@@ -140,11 +143,14 @@ class _Span(NamedTuple):
 def _reduced(
     parameters: tuple[System, Scalar, Scalar], guess: Y, place: int, span: _Span, newton: Newton
 ) -> ReducedIterate:
-    x = parameters[-1]
+    system, t0, x = parameters
     flat, unravel = jfu.ravel_pytree(guess)
 
     def state(others: Array, x: Scalar) -> Y:
         return unravel(jnp.insert(others, place, x))
+
+    def without(x: Array) -> Array:
+        return jnp.delete(x, place, assume_unique_indices=True)
 
     def advance(others: Array, parameters: tuple) -> tuple[Array, RESULTS]:
         system, t0, x = parameters
@@ -154,13 +160,15 @@ def _reduced(
         return select(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0], jnp.nan), sol.result
 
     def residual(others: Array, parameters: tuple) -> Array:
-        return jnp.delete(advance(others, parameters)[0], place, assume_unique_indices=True) - others
+        return without(advance(others, parameters)[0]) - others
 
-    others = jnp.delete(flat, place, assume_unique_indices=True)
-    others, converged = find_root(residual, others, parameters, newton)
+    model, y0 = SwitchedSystem.forwards(system, t0, guess), state(without(flat), x)
+    field = ravel(model.flow(t0, y0, at_start(model, t0, y0, span.mode)))
+    sizes = without(span.integrator.sizes_at(ravel(y0), field, jnp.asarray(system.period, t0.dtype) * span.order))
+    others, converged = find_root(residual, without(flat), parameters, newton, sizes=Sizes(sizes, sizes))
     after, result = advance(others, parameters)
-    gap = jnp.max(jnp.abs(jnp.delete(after, place, assume_unique_indices=True) - others))
-    good = converged & (gap <= 1e3 * newton.tol * (1 + jnp.max(jnp.abs(after)))) & is_okay(result)
+    gap, smallest = jnp.max(jnp.abs(without(after) - others)), span.integrator.smallest_size(t0.dtype)
+    good = converged & (gap <= 1e3 * newton.tol * (smallest + jnp.max(jnp.abs(after)))) & is_okay(result)
     result = RESULTS.where(good, result, RESULTS.reduced_map_not_found)
     value, y = unless_failed(result, (after[place], state(others, x)))
     return ReducedIterate(value, y, result)

@@ -234,12 +234,17 @@ def fractions(autonomous: bool, order: int) -> tuple[list[int], np.ndarray]:
 
 
 def judge(
-    converged: Bool[Array, ""], x: Array, later: Float[Array, "fractions n"], autonomous: bool, order: int
+    converged: Bool[Array, ""],
+    x: Array,
+    later: Float[Array, "fractions n"],
+    autonomous: bool,
+    order: int,
+    smallest: Scalar,
 ) -> RESULTS:
-    """What was found, from the states at fractions of the period."""
+    """What was found, from the states at fractions of the period. States below `smallest` count as zero."""
     primes, shares = fractions(autonomous, order)
     away = distance(later, x)
-    amplitude, size = jnp.max(away), 1 + jnp.max(jnp.abs(x))
+    amplitude, size = jnp.max(away), smallest + jnp.max(jnp.abs(x))
     repeats = jnp.zeros((), bool)
     for p in primes:
         repeats = repeats | (away[int(np.argmin(np.abs(shares - 1 / p)))] <= 1e-6 * amplitude)

@@ -31,7 +31,7 @@ from ._guess import at_start, of_relays, Relays
 from ._orbit import distance, ravel
 
 
-FAR = 1e9  # never reached: bounds on steps and events end the way
+FAR = 1e10  # never reached, over the fastest rate of the model: bounds on steps and events end the way
 STEPS, EVENTS = 2000, 1000  # after which an autonomous solution counts as settled
 LAPS = 100  # after which a forced one does
 SETTLED = 1e-13  # relative: a lap that moves the state by less changes nothing any more
@@ -59,30 +59,44 @@ def settle_down(
         return Settled(y0, jnp.asarray(system.period, t0.dtype), no, mode, no)
     # How long it takes is measured in steps of the integration, which know the system's own scale of time. Only a guess
     # is wanted: a loose tolerance makes long steps, and so the solution is followed farther.
-    loose, last = _loose(integrator, t0.dtype), None
+    far = t0 + sign * _far(system, t0, y0, mode)
+    loose, last, smallest = (
+        _loose(integrator, t0.dtype),
+        None,
+        jnp.asarray(integrator.smallest_size(t0.dtype), t0.dtype),
+    )
     if not concrete:
         big = loose._replace(max_steps=STEPS, max_events=EVENTS)
-        last = integrate(system, t0, t0 + sign * FAR, y0, big, mode=mode)
+        last = integrate(system, t0, far, y0, big, mode=mode)
         given = tuple(last.mode1) if system.switches else None
-        loop = integrate(system, t0, t0 + sign * FAR, last.y1, big, mode=given, saveat=dfx.SaveAt(dense=True))
-        return _returned(system, last, loop, t0, sign)
+        loop = integrate(system, t0, far, last.y1, big, mode=given, saveat=dfx.SaveAt(dense=True))
+        return _returned(system, last, loop, t0, sign, smallest)
     steps = events = 0
     while last is None or (steps < STEPS and events < EVENTS and bool(_goes_on(last))):
-        last = _followed(system, t0, t0 + sign * FAR, y0, mode, loose)
+        last = _followed(system, t0, far, y0, mode, loose)
         y0, mode = last.y1, of_relays(system, last.mode1)
         steps, events = steps + int(last.stats["num_steps"]), events + int(last.events.num)
-    loop = _followed(system, t0, t0 + sign * FAR, y0, mode, loose)
-    return _returned(system, last, loop, t0, sign)
+    loop = _followed(system, t0, far, y0, mode, loose)
+    return _returned(system, last, loop, t0, sign, smallest)
 
 
 def failure(system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrator: Integrator) -> str | None:
     """Returns why and where the solution from a guess fails, or None if it does not."""
     if system.period is None:
-        end, integrator = t0 + sign * FAR, _loose(integrator, t0.dtype)
+        end, integrator = t0 + sign * _far(system, t0, y0, mode), _loose(integrator, t0.dtype)
     else:
         end = t0 + sign * jnp.asarray(system.period, t0.dtype)
     sol = _followed(system, t0, end, y0, mode, integrator)
     return None if bool(_goes_on(sol) | is_okay(sol.result)) else explain(system, sol, end)
+
+
+@interactive
+def _far(system: System, t0: Scalar, y0: Y, mode: Any) -> Scalar:
+    """A time that no search reaches: in the unit of the largest eigenvalue of the field's derivative."""
+    model = SwitchedSystem.forwards(system, t0, y0)
+    state, (x, unravel) = at_start(model, t0, y0, mode), jfu.ravel_pytree(y0)
+    rate = jnp.max(jnp.abs(jnp.linalg.eigvals(jax.jacfwd(lambda x: ravel(model.flow(t0, unravel(x), state)))(x))))
+    return FAR / select(jnp.isfinite(rate) & (rate > 0), rate, 1)
 
 
 def _goes_on(sol: Solution) -> Bool[Array, ""]:
@@ -95,7 +109,7 @@ def _loose(integrator: Integrator, dtype: Any) -> Integrator:
     controller = integrator.stepsize_controller
     if not isinstance(controller, dfx.PIDController):
         return integrator._replace(stepsize_controller=dfx.PIDController(rtol=tol, atol=tol))
-    controller = eqx.tree_at(lambda c: (c.rtol, c.atol), controller, (tol, tol))
+    controller = eqx.tree_at(lambda c: (c.rtol, c.atol), controller, (tol, tol * integrator.smallest_size(dtype)))
     return integrator._replace(stepsize_controller=controller)
 
 
@@ -105,8 +119,8 @@ def _followed(system: System, t0: Scalar, t1: Scalar, y0: Y, mode: Any, integrat
 
 
 @interactive
-def _returned(system: System, last: Solution, loop: Solution, t0: Scalar, sign: float) -> Settled:
-    """From the solution up to where it has settled, and from there on."""
+def _returned(system: System, last: Solution, loop: Solution, t0: Scalar, sign: float, smallest: Scalar) -> Settled:
+    """From the solution up to where it has settled, and from there on. States below `smallest` count as zero."""
     starts, stops, _, _, steps = loop.dense
     # Eight points a step: the polynomial between control points bends little.
     u = jnp.asarray(np.arange(8) / 8, starts.dtype)
@@ -129,7 +143,7 @@ def _returned(system: System, last: Solution, loop: Solution, t0: Scalar, sign: 
     near = far & (gap < 0.1)
     low = near & (gap <= jnp.roll(gap, 1)) & (gap <= jnp.roll(gap, -1))
     ended = (last.result == RESULTS.max_steps_reached) | (last.result == RESULTS.successful)
-    rests = ended & (jnp.max(scale) <= 1e-4 * (1 + jnp.max(jnp.abs(here))))
+    rests = ended & (jnp.max(scale) <= 1e-4 * (smallest + jnp.max(jnp.abs(here))))
     period = select(rests, 0, sign * (times[jnp.argmax(low)] - t0))
     failed = ~(_goes_on(last) | is_okay(last.result))
     return Settled(last.y1, period, rests, of_relays(system, last.mode1), failed)
@@ -140,12 +154,14 @@ def _laps(
 ) -> Iterator[Solution]:
     """A solution of a forced system, period by period, up to where it repeats itself or fails. The bounds of
     `integrator` are those of one period."""
-    end = t0 + sign * jnp.asarray(system.period, t0.dtype)
+    end, smallest = t0 + sign * jnp.asarray(system.period, t0.dtype), float(integrator.smallest_size(t0.dtype))
     for _ in range(number):
         sol = _followed(system, t0, end, y0, mode, integrator)
         yield sol
         before, after = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(y)]) for y in (y0, sol.y1))
-        if np.max(np.abs(after - before)) <= SETTLED * (1 + np.max(np.abs(after))) or not bool(is_okay(sol.result)):
+        if np.max(np.abs(after - before)) <= SETTLED * (smallest + np.max(np.abs(after))) or not bool(
+            is_okay(sol.result)
+        ):
             return
         y0, mode = sol.y1, of_relays(system, sol.mode1)
 
@@ -162,13 +178,14 @@ def repeats(system: System, t0: Scalar, y0: Y, sign: float, mode: Any, integrato
 
 def repeats_held(system: System, t0: Scalar, y: Y, period: Scalar, mode: Any, integrator: Integrator) -> bool:
     """Whether a state of a forced system comes back, held by friction all the time."""
-    return bool(_comes_back_held(_followed(system, t0, t0 + period, y, mode, integrator), t0, y))
+    smallest = jnp.asarray(integrator.smallest_size(t0.dtype), t0.dtype)
+    return bool(_comes_back_held(_followed(system, t0, t0 + period, y, mode, integrator), t0, y, smallest))
 
 
 @interactive
-def _comes_back_held(sol: Solution, t0: Scalar, y: Y) -> Bool[Array, ""]:
+def _comes_back_held(sol: Solution, t0: Scalar, y: Y, smallest: Scalar) -> Bool[Array, ""]:
     begin, end, _, modes = arcs(sol, t0, y)
-    back = distance(ravel(sol.y1), ravel(y)) <= 1e-8 * (1 + jnp.max(jnp.abs(ravel(y))))
+    back = distance(ravel(sol.y1), ravel(y)) <= 1e-8 * (smallest + jnp.max(jnp.abs(ravel(y))))
     return is_okay(sol.result) & back & held_throughout(sol.system, begin, end, modes)
 
 

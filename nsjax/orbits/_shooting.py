@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool
 
 from .._numerics._autodiff import frozen
 from .._numerics._compile import interactive
-from .._numerics._root import find_root, Newton
+from .._numerics._root import find_root, Newton, Sizes
 from .._numerics._select import select
 from .._types import Scalar, Y
 from ..derivatives._floquet import floquet, forwards, structural_zeros
@@ -61,6 +61,11 @@ class Shooting(NamedTuple):
         """Of the period, over which the equations integrate."""
         return 1.0 if self.symmetry is None else 0.5
 
+    def sizes(self, x: Array, field: Array, period: Scalar, autonomous: bool) -> Sizes:
+        """The units of unknowns and equations, from a state of the orbit and the field there."""
+        states = self.integrator.sizes_at(x, field, period)
+        return Sizes(jnp.append(states, 1), jnp.append(states, period)) if autonomous else Sizes(states, states)
+
     def equations(self, z: Array, last: Array, section: "_Section | None", unravel: Callable[[Array], Y]) -> Array:
         """What vanishes, from the unknowns and the state at the end. The base point of an autonomous system stays on
         the section through the guess: Poincaré's phase condition."""
@@ -91,11 +96,11 @@ class _Section(NamedTuple):
         speed = self.normal @ self.normal
         return self.normal @ (x - self.guess) / select(speed == 0, 1, speed)
 
-    def at_rest(self, x: Array, field: Array) -> Bool[Array, ""]:
+    def at_rest(self, x: Array, field: Array, smallest: Scalar) -> Bool[Array, ""]:
         """Whether the search was in an equilibrium, or ended in one: near it Newton's Jacobian is singular, and it
-        seldom says that it converged."""
-        slow = jnp.sqrt(self.normal @ self.normal) * self.period <= 1e-9 * (1 + jnp.max(jnp.abs(self.guess)))
-        return slow | (jnp.max(jnp.abs(field)) * self.period <= 1e-6 * (1 + jnp.max(jnp.abs(x))))
+        seldom says that it converged. States below `smallest` count as zero."""
+        slow = jnp.sqrt(self.normal @ self.normal) * self.period <= 1e-9 * (smallest + jnp.max(jnp.abs(self.guess)))
+        return slow | (jnp.max(jnp.abs(field)) * self.period <= 1e-6 * (smallest + jnp.max(jnp.abs(x))))
 
 
 @interactive
@@ -109,7 +114,11 @@ def _searched(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Sca
         base = base_point(still, t_still, guess, first_period, sign, mode, integrator)
         guess, first_period, mode = lax.stop_gradient(base)
         section = _Section.through(still, t_still, guess, first_period, mode)
-    unravel = jfu.ravel_pytree(guess)[1]
+    at, unravel = jfu.ravel_pytree(guess)
+    start = _unknowns(guess, first_period, autonomous)
+    model = SwitchedSystem.forwards(still, t_still, guess)
+    field = section.normal if autonomous else ravel(model.flow(t_still, guess, at_start(model, t_still, guess, mode)))
+    sizes = shooting.sizes(at, field, shooting.period(at, start, still), autonomous)
 
     def residual(z: Array, parameters: tuple) -> Array:
         system, t0 = parameters
@@ -119,7 +128,7 @@ def _searched(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Sca
         return shooting.equations(z, _reached(sol), section, unravel)
 
     # What depends on parameters does so by the second argument alone: the search needs no derivatives.
-    z, converged = find_root(residual, _unknowns(guess, first_period, autonomous), (system, t0), shooting.newton)
+    z, converged = find_root(residual, start, (system, t0), shooting.newton, sizes=sizes)
     x = z[:-1] if autonomous else z
     period = shooting.period(x, z, system)
     shares = jnp.asarray(fractions(autonomous, shooting.order)[1], t0.dtype)
@@ -212,7 +221,8 @@ def _tried(
         last = _reached(sol) + monodromy @ (x - lax.stop_gradient(x)) + speed * change
         return shooting.equations(z, last, section, unravel)
 
-    step = shooting.newton.step(z, residual(z), jax.jacfwd(residual)(z))
+    sizes = shooting.sizes(x, speed, period, autonomous)
+    step = shooting.newton.step(z, residual(z), jax.jacfwd(residual)(z), sizes)
     better = base_on(sol, t0, unravel(x), period, sign) if autonomous else base
     shares = jnp.asarray(fractions(autonomous, shooting.order)[1], t0.dtype)
     later = jax.vmap(lambda t: ravel(sol.evaluate(t)))(t0 + sign * period * shares)
@@ -241,14 +251,14 @@ def _described(
     and at its end the monodromy matrix."""
     system, t0, integrator, (later, monodromy) = sol.system, sol.t0, shooting.integrator, along
     model, x, autonomous = SwitchedSystem.forwards(system, t0, y0), ravel(y0), system.period is None
-    error = distance(ravel(sol.y1), x)
+    error, smallest = distance(ravel(sol.y1), x), shooting.integrator.smallest_size(x.dtype)
     # A relay has a memory: its mode must come back with the state.
     closes = jnp.all(jnp.asarray([sol.mode0[k] == sol.mode1[k] for k in model.of_kind(relay)], bool))
-    good = converged & (error <= 1e3 * shooting.newton.tol * (1 + jnp.max(jnp.abs(x)))) & is_okay(sol.result) & closes
-    result = judge(good, x, later, autonomous, shooting.order)
+    near = error <= 1e3 * shooting.newton.tol * (smallest + jnp.max(jnp.abs(x)))
+    result = judge(converged & near & is_okay(sol.result) & closes, x, later, autonomous, shooting.order, smallest)
     if section is not None:
         field = ravel(model.flow(t0, y0, at_start(model, t0, y0, mode)))
-        result = RESULTS.where(section.at_rest(x, field), RESULTS.orbit_is_equilibrium, result)
+        result = RESULTS.where(section.at_rest(x, field, smallest), RESULTS.orbit_is_equilibrium, result)
     grazes = (sol.result == RESULTS.tangential_event) & (result == RESULTS.successful)
     result = RESULTS.where(grazes, RESULTS.tangential_event, result)
     begin, stop, y, modes = arcs(sol, t0, y0)

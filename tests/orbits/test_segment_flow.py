@@ -43,7 +43,7 @@ class Driven(nsjax.System):
 def flow_of(system, exact, slides=True):
     system = arrays_of(system, jnp.float64)
     model = SwitchedSystem.forwards(system, jnp.zeros(()), Y)
-    return SegmentFlow(model, FreeParameters.of(system, ("omega",)), system.omega, Y, HOW, exact, slides)
+    return SegmentFlow(model, FreeParameters.of(system, ("omega",)), system.omega, Y, jnp.ones(2), HOW, exact, slides)
 
 
 def at(flow, omega):
@@ -146,12 +146,14 @@ def test_tangents_of_the_model(exact):
     both = FreeParameters.of(model.system, ("k",), ("c",))
 
     def end(p, x=y, free=both):
-        flow = SegmentFlow(model, free, p, y, HOW, exact, False)
+        flow = SegmentFlow(model, free, p, y, jnp.ones(1), HOW, exact, False)
         return flow.arrive(jnp.zeros(()), t, x, ModeState((), (), ()))[0]
 
     def by_arrays(p):
         system = dataclasses.replace(model.system, k=p[0], c=p[1])
-        flow = SegmentFlow(model.with_system(system), FreeParameters.of(system), jnp.zeros(0), y, HOW, exact, False)
+        flow = SegmentFlow(
+            model.with_system(system), FreeParameters.of(system), jnp.zeros(0), y, jnp.ones(1), HOW, exact, False
+        )
         return flow.arrive(jnp.zeros(()), t, y, ModeState((), (), ()))[0]
 
     def closed(p):

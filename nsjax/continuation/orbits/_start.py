@@ -83,8 +83,9 @@ def _sizes(curve: OrbitCurve, start: Start, value: float) -> np.ndarray:
     rows = rows[np.isfinite(rows).all(axis=1)]
     sizes = np.ptp(rows, axis=0) / 2
     largest, away = sizes.max(), np.abs(rows).max()
-    if largest <= AT_REST:
-        return np.full_like(sizes, away if away > AT_REST else 1.0)
+    at_rest = AT_REST * float(curve.integrator.smallest_size(np.float64))
+    if largest <= at_rest:
+        return np.full_like(sizes, away if away > at_rest else 1.0)
     return np.where(sizes > 1e-12 * largest, sizes, largest)
 
 

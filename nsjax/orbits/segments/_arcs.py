@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..._numerics._autodiff import frozen
 from ..._numerics._compile import interactive
 from ..._numerics._minima import grouped, in_order, Minima, minima, places_of, THETA
 from ..._numerics._select import select
@@ -73,6 +74,7 @@ class Flows(eqx.Module):
     within: ModeState
     t0: Scalar
     y0: Y
+    sizes: Float[Array, " n"]  # of the state, for the tolerances of the solver
     pieces: int = eqx.field(static=True)
     integrator: Integrator = eqx.field(static=True)
 
@@ -82,9 +84,10 @@ class Flows(eqx.Module):
 
     def piece(self, a: Scalar, b: Scalar, x: Array, state: ModeState, saveat: dfx.SaveAt) -> Any:
         unravel = jfu.ravel_pytree(self.y0)[1]
-        smooth = ModeFlow(self.model, state)
-        sol = integrate(smooth, a, b, unravel(x), self.integrator, saveat=saveat)
-        flat = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys)
+        smooth = ModeFlow(self.model, state, unravel(self.sizes))
+        relative = self.integrator.in_sizes(x.dtype)
+        sol = integrate(smooth, a, b, unravel(x / self.sizes), relative, saveat=saveat)
+        flat = jax.vmap(lambda y: jfu.ravel_pytree(y)[0] * self.sizes)(sol.ys)
         return jax.tree.map(lambda y: select(is_okay(sol.result), y, jnp.nan), flat)
 
     def rows(self, fn: Any, begin: Array, end: Array, x: Array) -> Any:
@@ -145,7 +148,10 @@ def flows_of(system: System, arcs: Arcs, integrator: Integrator) -> tuple[Flows,
     model = SwitchedSystem.forwards(system, arcs.begin[0], y0, smooth=True)
     within = jax.vmap(lambda t, y, mode: model.state_at(t, y, tuple(mode)))(arcs.begin, first, arcs.mode)
     x = jax.vmap(jax.vmap(lambda y: jfu.ravel_pytree(y)[0]))(arcs.y)
-    return Flows(system, within, arcs.begin[0], y0, x.shape[1], integrator), x
+    first, last = arcs.begin[0], jnp.max(arcs.end)
+    field, _ = jfu.ravel_pytree(model.flow(first, y0, jax.tree.map(lambda leaf: leaf[0], within)))
+    sizes = frozen(integrator.sizes_of(jnp.max(jnp.abs(x), axis=(0, 1)), field, last - first))
+    return Flows(system, within, first, y0, sizes, x.shape[1], integrator), x
 
 
 @interactive

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..._numerics._autodiff import frozen
 from ..._numerics._compile import interactive
 from ..._numerics._select import select
 from ..._types import Scalar, Y
@@ -90,7 +91,8 @@ class OrbitCurve(eqx.Module):
 
     def flow(self, value: Array) -> SegmentFlow:
         """That of the modes with a value of the parameter (or of several)."""
-        return SegmentFlow(self.model, self.free, value, self.like, self.integrator, self.exactly, self.slides)
+        sizes = frozen(jnp.asarray(self.sizes))
+        return SegmentFlow(self.model, self.free, value, self.like, sizes, self.integrator, self.exactly, self.slides)
 
     @property
     def exactly(self) -> bool:
@@ -218,7 +220,7 @@ class OrbitCurve(eqx.Module):
                 out = select(ends == REPELLING_EXIT, holding, out)
             out = out / (jnp.asarray(self.guard_sizes)[slot] if model.slots else 1)
             closing = self.normal @ (first - self.reference) if forced is None else b - begin[0] - forced
-            return select(ends == TIME, closing, out)
+            return select(ends == TIME, closing / self.time, out)
 
         first, since, whence = x[0], begin, x
         if self.pieces > 1:  # what holds where a segment begins holds at its first piece

@@ -43,6 +43,7 @@ class SegmentFlow(eqx.Module):
     free: FreeParameters
     value: Array
     like: Y
+    sizes: Float[Array, " n"]  # of the state, for the tolerances of the solver
     integrator: Integrator = eqx.field(static=True)
     exact: bool = eqx.field(static=True)
     slides: bool = eqx.field(static=True)  # whether modes that are held occur
@@ -54,9 +55,14 @@ class SegmentFlow(eqx.Module):
     @property
     def missed(self) -> float:
         """By which part of a state of size one its dense output may be wrong."""
-        found = [getattr(self.integrator.stepsize_controller, name, 0.0) for name in ("rtol", "atol")]
+        found = [getattr(self.relative.stepsize_controller, name, 0.0) for name in ("rtol", "atol")]
         worst = max(float(np.max(x)) for tolerance in found for x in jax.tree.leaves(tolerance) or [0.0])
         return 0.0 if self.exact else TRUSTED * worst
+
+    @property
+    def relative(self) -> Integrator:
+        """The integrator for states that are measured in `sizes`."""
+        return self.integrator.in_sizes(self.sizes.dtype)
 
     def unravel(self, x: Array) -> Y:
         return jfu.ravel_pytree(self.like)[1](x)
@@ -91,10 +97,10 @@ class SegmentFlow(eqx.Module):
         far = select(span > 0, b, jnp.nextafter(a, jnp.inf))
         none = jax.tree.map(jnp.zeros_like, self.like)
         saveat = dfx.SaveAt(subs=dfx.SubSaveAt(ts=select(span > 0, ts, a), fn=lambda t, y, args: y[0]))
-        summed = _Summed(self.model, state)
-        sol = integrate(summed, a, far, (self.unravel(x), none, none), self.integrator, saveat=saveat)
-        xs = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys)
-        sums = jnp.stack([jfu.ravel_pytree(part)[0] for part in sol.y1[1:]])
+        summed = _Summed(self.model, state, self.unravel(self.sizes))
+        sol = integrate(summed, a, far, (self.unravel(x / self.sizes), none, none), self.relative, saveat=saveat)
+        xs = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys) * self.sizes
+        sums = jnp.stack([jfu.ravel_pytree(part)[0] * self.sizes**k for k, part in enumerate(sol.y1[1:], 1)])
         return ts, select(span > 0, xs, x), select(span > 0, sums, 0)
 
 
@@ -119,11 +125,11 @@ def states_along(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeS
 
 
 class _Summed(ModeFlow):
-    """The field of one mode, and the integrals of the state and of its squares."""
+    """The field of one mode, and the integrals of the state and of its square, all in `sizes`."""
 
     def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
         y, _, _ = y
-        return self.model.flow(t, y, self.state), y, jax.tree.map(jnp.square, y)
+        return self.field(self.model, t, y), y, jax.tree.map(jnp.square, y)
 
 
 def _exponential(
@@ -168,9 +174,9 @@ def _hermite(s: np.ndarray) -> np.ndarray:
 def _arrive(flow: SegmentFlow, a: Any, b: Any, x: Any, state: Any) -> Array:
     if flow.exact:
         return _exponential(flow, a, b, x, state)[0]
-    smooth = ModeFlow(flow.model, state)
-    sol = integrate(smooth, a, b, flow.unravel(x), flow.integrator)
-    return select(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0], jnp.nan)
+    smooth = ModeFlow(flow.model, state, flow.unravel(flow.sizes))
+    sol = integrate(smooth, a, b, flow.unravel(x / flow.sizes), flow.relative)
+    return select(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0] * flow.sizes, jnp.nan)
 
 
 @_arrive.def_jvp
@@ -225,8 +231,9 @@ def _varied(
         numbers = jax.linearize(lambda values: eqx.filter(at(values).model, depends), values)[1]
         moved = jax.vmap(numbers)(eye[:, n:].astype(values.dtype))
     columns = jax.vmap(flow.unravel)(eye[:, :n])
-    sol = integrate(VariedModeFlow(flow.model, state, moved), a, b, (flow.unravel(x), columns), flow.integrator)
+    smooth = VariedModeFlow(flow.model, state, flow.unravel(flow.sizes), moved)
+    sol = integrate(smooth, a, b, (flow.unravel(x / flow.sizes), columns), flow.relative)
     y, along = sol.y1
-    out = select(is_okay(sol.result), jfu.ravel_pytree(y)[0], jnp.nan)
-    phi = jax.vmap(lambda c: jfu.ravel_pytree(c)[0], out_axes=1)(along)
-    return out, phi[:, :n], phi[:, n:]
+    out = select(is_okay(sol.result), jfu.ravel_pytree(y)[0] * flow.sizes, jnp.nan)
+    phi = jax.vmap(lambda c: jfu.ravel_pytree(c)[0], out_axes=1)(along) * flow.sizes[:, None]
+    return out, phi[:, :n] / flow.sizes, phi[:, n:]

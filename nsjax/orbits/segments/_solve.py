@@ -50,16 +50,16 @@ def by_segments(
     """Newton's method on the equations of all segments, and what is said of the orbit."""
     guess = frozen(guess)
     curve, itinerary, start = _problem(system, guess, t0, order, pieces, integrator)
-    u, linear, converged = isolated_orbit(curve, itinerary, start.at[0].set(t0), start, newton)
+    u, linear, converged = isolated_orbit(curve, itinerary, start.at[0].set(t0 / curve.time), start, newton)
     begin, end, x, _ = curve.parts(u)
     error = jnp.max(jnp.abs(linear.f))
-    good = converged & (error <= 1e3 * newton.tol * (1 + jnp.max(jnp.abs(x))))
+    good = converged & (error <= 1e3 * newton.tol)
     autonomous, num = curve.autonomous, itinerary.num
     period = end[num - 1] - t0 if autonomous else jnp.asarray(system.period, t0.dtype) * order
     still, here = frozen((curve, u))
     _, shares = fractions(autonomous, order)
     later = _states_at(still, itinerary, here, t0 + lax.stop_gradient(period) * jnp.asarray(shares, t0.dtype))
-    result = judge(good, x[0], later, autonomous, order)
+    result = judge(good, x[0], later, autonomous, order, integrator.smallest_size(t0.dtype))
 
     events = _log(curve, itinerary, u, linear)
     index = jnp.arange(len(begin), dtype=num.dtype)
@@ -76,7 +76,7 @@ def by_segments(
     happened = jnp.isfinite(events.t)
     grazes = jnp.any(happened & ~meant & (events.transversality == 0))
     violation, violation_t = _violation(still, itinerary, here)
-    admissible = (violation == 0) & jnp.all(end - begin >= -1e3 * newton.tol * (1 + jnp.abs(period)))
+    admissible = (violation == 0) & jnp.all(end - begin >= -1e3 * newton.tol * jnp.abs(period))
     result = RESULTS.where((result == RESULTS.successful) & grazes, RESULTS.tangential_event, result)
     result = RESULTS.where(is_okay(result) & ~admissible, RESULTS.orbit_not_admissible, result)
     every = slice(None, None, pieces)
@@ -106,12 +106,13 @@ def _problem(
     system: System, guess: SegmentGuess, t0: Scalar, order: int, pieces: int, integrator: Integrator
 ) -> tuple[OrbitCurve, OrbitItinerary, Float[Array, " unknowns"]]:
     """The curve of one point, without a parameter, the itinerary with a row for each piece, and a guess of the
-    unknowns. They are in the units of the model."""
+    unknowns."""
     y0 = jax.tree.map(lambda y: y[0], guess.y)
     model = SwitchedSystem.forwards(system, t0, y0, smooth=True)
     x = jax.vmap(ravel)(guess.y)
-    n, one, none = x.shape[1], jnp.ones_like(t0), jnp.zeros(0, t0.dtype)
+    n, none = x.shape[1], jnp.zeros(0, t0.dtype)
     rows, still = guess.itinerary, frozen(model)
+    period = jnp.max(select(jnp.arange(len(x), dtype=rows.num.dtype) < rows.num, guess.end, t0)) - t0
     blank = OrbitCurve(
         model=model,
         free=FreeParameters.of(system),
@@ -119,7 +120,7 @@ def _problem(
         low=none,
         width=none,
         sizes=jnp.ones(n, t0.dtype),
-        time=one,
+        time=select(period > 0, period, 1),
         guard_sizes=jnp.ones(len(model.slots), t0.dtype),
         order=jnp.asarray(order, jnp.int32),
         normal=jnp.zeros(n, t0.dtype),
@@ -131,10 +132,13 @@ def _problem(
     )
     f = ravel(still.flow(guess.begin[0], y0, blank.state(rows.mode[0], rows.part[0])))
     normal = f / select(f @ f == 0, 1, f @ f)
-    sizes = guard_sizes_at(frozen(blank), rows, guess.begin, x)
-    curve = dataclasses.replace(blank, normal=normal, guard_sizes=sizes)
+    sizes = integrator.sizes_of(jnp.max(jnp.abs(x), axis=0), f, blank.time)
+    curve = frozen(dataclasses.replace(blank, normal=normal, sizes=sizes))
+    curve = dataclasses.replace(curve, guard_sizes=guard_sizes_at(curve, rows, guess.begin, x))
+    units = jnp.concatenate([jnp.stack([curve.time, curve.time]), sizes])
     if pieces == 1:
-        return curve, rows, jnp.concatenate([guess.begin[:, None], guess.end[:, None], x], axis=1).ravel()
+        start = jnp.concatenate([guess.begin[:, None], guess.end[:, None], x], axis=1)
+        return curve, rows, (start / units).ravel()
     flow, shares = dataclasses.replace(curve, model=still).flow(none), jnp.arange(pieces, dtype=t0.dtype) / pieces
 
     def cut(a: Scalar, b: Scalar, x: Array, mode: Array, part: Array) -> Array:
@@ -143,11 +147,11 @@ def _problem(
         states = jnp.concatenate([x[None], states])
         return jnp.concatenate([starts[:, None], jnp.append(starts[1:], b)[:, None], states], axis=1)
 
-    start = jax.vmap(cut)(guess.begin, guess.end, x, rows.mode, rows.part).ravel()
+    start = jax.vmap(cut)(guess.begin, guess.end, x, rows.mode, rows.part) / units
     mode, part, ends, slot, entry = (jnp.repeat(column, pieces, axis=0) for column in rows[:5])
     last = jnp.arange(len(ends), dtype=rows.num.dtype) % pieces == pieces - 1
     ends = select(last, ends, PIECE)
-    return curve, OrbitItinerary(mode, part, ends, slot, entry, rows.num * pieces), start
+    return curve, OrbitItinerary(mode, part, ends, slot, entry, rows.num * pieces), start.ravel()
 
 
 def _states_at(
@@ -248,9 +252,6 @@ def _violation(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array) -> tuple[
     slots, n = len(curve.model.slots), x.shape[1]
     if not slots:
         return jnp.zeros_like(begin[0]), begin[0]
-    # As large as the orbit, so that what its dense output misses is known.
-    size = 1 + jnp.max(jnp.abs(x))
-    curve = dataclasses.replace(curve, sizes=curve.sizes * size, guard_sizes=curve.guard_sizes * size)
     orders = jnp.zeros((2, 2 * n + slots), x.dtype)
     segments = begin, end, x, itinerary.mode, itinerary.part
     found = jax.vmap(lambda *segment: along_segment(curve, value, segment, orders, turns=False))(*segments)
