@@ -83,7 +83,8 @@ def fundamental_matrix(
     else:
         sol = solve(system, t0, t1, y0, **how)
         return matrices_along(sol, y0, ts, integrator, throw)
-    phi = _checked(sol, t0, times, phi, throw)
+    phi, bad, result = _checked(sol, t0, times, phi, RESULTS.successful)
+    phi = raise_if(bad, result, phi) if throw else phi
     return phi[0] if ts is None else phi
 
 
@@ -91,17 +92,22 @@ def matrices_along(sol: Solution, y0: Y, ts: Any, integrator: Integrator, throw:
     """`fundamental_matrix` along a solution that is known, which set out from `y0`, by the variational equation."""
     t0 = jnp.asarray(sol.t0)
     times = jnp.asarray([sol.t1] if ts is None else ts, t0.dtype)
-    whole, phi = _by_arcs(arrays_of(sol.system, t0.dtype), sol, t0, y0, times, integrator)
-    phi = _checked(sol, t0, times, whole[None] if ts is None else phi, throw)
+    whole, phi, result = _by_arcs(arrays_of(sol.system, t0.dtype), sol, t0, y0, times, integrator)
+    phi, bad, result = _checked(sol, t0, times, whole[None] if ts is None else phi, result)
+    phi = raise_if(bad, result, phi) if throw else phi
     return phi[0] if ts is None else phi
 
 
 @interactive
-def _checked(sol: Solution, t0: Scalar, times: Array, phi: Array, throw: bool) -> Array:
-    """NaN, or an error, where there are no derivatives."""
+def _checked(
+    sol: Solution, t0: Scalar, times: Array, phi: Array, result: RESULTS
+) -> tuple[Array, Bool[Array, ""], RESULTS]:
+    """The derivatives, which are NaN where there are none: beyond a grazing, or where the variational equation could
+    not be integrated (`result` is that of its integration); whether some are missing, and why."""
     beyond = _beyond_grazing(sol, t0, times)
     phi = select(beyond[:, None, None], jnp.nan, phi)
-    return raise_if(jnp.any(beyond), RESULTS.tangential_event, phi) if throw else phi
+    grazes = jnp.any(beyond)
+    return phi, grazes | ~is_okay(result), RESULTS.where(grazes, RESULTS.tangential_event, result)
 
 
 def _beyond_grazing(sol: Solution, t0: Scalar, times: Float[Array, " times"]) -> Bool[Array, " times"]:
@@ -156,9 +162,10 @@ def _by_arcs(
     times: Array,
     integrator: Integrator,
     skipped: Int[Array, ""] | int = 0,
-) -> tuple[Float[Array, "n n"], Float[Array, "times n n"]]:
+) -> tuple[Float[Array, "n n"], Float[Array, "times n n"], RESULTS]:
     """Φ at the end of `sol`, with the jump of an event there, and at `times`, from the arcs between the events and the
-    jumps at these; those of the first `skipped` are left out."""
+    jumps at these; those of the first `skipped` are left out. And whether every arc could be integrated; what depends
+    on one that could not is NaN."""
     flat, unravel = jfu.ravel_pytree(y0)
     model = SwitchedSystem.forwards(system, t0, y0)
     n = flat.size
@@ -179,7 +186,7 @@ def _by_arcs(
     sizes = frozen(integrator.sizes_of(largest, jfu.ravel_pytree(model.flow(t0, y0, first))[0], sol.t1 - t0))
     relative, jumps = integrator.in_sizes(flat.dtype), jumps * sizes / sizes[:, None]
 
-    def arc(phi: Array, a: Scalar, b: Scalar, y: Y, mode: Array, jump: Array) -> tuple[Array, Array]:
+    def arc(phi: Array, a: Scalar, b: Scalar, y: Y, mode: Array, jump: Array) -> tuple[Array, Array, RESULTS]:
         smooth = VariedModeFlow(model, model.state_at(a, y, tuple(mode)), unravel(sizes))
         # On an arc that runs backwards so do the times.
         low, high = jnp.minimum(a, b), jnp.maximum(a, b)
@@ -189,17 +196,19 @@ def _by_arcs(
         out = integrate(smooth, a, b, varied, relative, saveat=dfx.SaveAt(ts=inside[order]))
         done, along = is_okay(out.result), jax.vmap(matrix)(out.ys[1])
         along = jnp.zeros_like(along).at[order].set(along)
-        return select(done, matrix(out.y1[1]), jnp.nan), select(done, along, jnp.nan)
+        return select(done, matrix(out.y1[1]), jnp.nan), select(done, along, jnp.nan), out.result
 
     none = jnp.zeros((len(times), n, n), flat.dtype)
 
-    def turn(phi: Array, row: tuple) -> tuple[Array, Array]:
-        return lax.cond(row[0], arc, lambda phi, *_: (phi, none), phi, *row[1:])
+    def turn(c: tuple[Array, RESULTS], row: tuple) -> tuple[tuple[Array, RESULTS], Array]:
+        phi, result = c
+        phi, along, new = lax.cond(row[0], arc, lambda phi, *_: (phi, none, RESULTS.successful), phi, *row[1:])
+        return (phi, RESULTS.where(is_okay(result), new, result)), along
 
     there = jnp.arange(len(end), dtype=sol.events.num.dtype) <= sol.events.num
-    whole, by_arc = lax.scan(turn, eye, (there, begin, end, state, modes, jumps))
+    (whole, result), by_arc = lax.scan(turn, (eye, RESULTS.successful), (there, begin, end, state, modes, jumps))
     # Each time belongs to the arc that ends at or after it; the first one wins, so that Φ is that before a jump.
     sign = select(sol.t1 >= t0, 1, -1)
     index = jnp.clip(jnp.searchsorted(sign * end, sign * times, side="left"), 0, sol.events.num)
-    both = whole, by_arc[index, jnp.arange(len(times))]
-    return jax.tree.map(lambda phi: phi * sizes[:, None] / sizes, both)
+    along = by_arc[index, jnp.arange(len(times))]
+    return whole * sizes[:, None] / sizes, along * sizes[:, None] / sizes, result

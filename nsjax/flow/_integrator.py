@@ -10,6 +10,7 @@ from diffrax._root_finder import use_stepsize_tol
 from jax.core import Tracer
 
 from .._numerics._first_pass import is_first_pass
+from .._numerics._select import select
 from .steppers._exponential import AbstractExponential, Affine
 
 
@@ -90,7 +91,7 @@ class Integrator(NamedTuple):
         """Returns the size of each component of the state along a solution of length `span`, from the largest absolute
         values x of some of its states; where these are all zero, from the field at one of them."""
         small = x <= 1e-6 * jnp.abs(field * span)
-        return jnp.where(small, self.sizes_at(x, field, span), jnp.maximum(x, self.smallest_size(x.dtype)))
+        return select(small, self.sizes_at(x, field, span), jnp.maximum(x, self.smallest_size(x.dtype)))
 
     def in_sizes(self, dtype: Any) -> "Integrator":
         """The same for a state that is measured in its sizes."""

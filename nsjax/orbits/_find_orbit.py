@@ -95,7 +95,8 @@ def find_orbit(
     - `pieces`: into how many pieces of equal length each segment is divided: multiple shooting, for orbits so unstable
         that no single solution follows them.
     - `solver`, `stepsize_controller`, `rtol`, `atol`, `max_steps`, `max_events`: as for `solve`; by default Dopri8 with
-        tolerances of 1e-12 (float32: 1e-6).
+        tolerances of 1e-12 (float32: 1e-6). States that are much smaller than 1 need an `atol` in their own unit: a
+        search takes from it which states count as zero, too.
     - `tol`, `max_newton_steps`: of Newton's method, by default 1e-10 (float32: 1e-4) and 30. (`max_steps` are those of
         each solution.)
     - `adjoint`: `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`; for `jax.grad` and `jax.linearize` (and so for

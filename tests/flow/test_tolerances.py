@@ -141,8 +141,33 @@ def test_integers_wherever_a_state_is_taken():
 
 
 def test_newton_s_steps_are_named_as_in_optimistix():
-    plane = gallery.HopfPitchfork(mu=1.0)
-    found = nsjax.find_equilibrium(plane, gallery.Plane(5.0, 1.0), max_steps=1, throw=False)
+    found = nsjax.find_equilibrium(Toppling(), Motion(1.0, 0.0), max_steps=1, throw=False)
     assert found.result != nsjax.RESULTS.successful
     with pytest.raises(TypeError, match="`max_newton_steps"):
         nsjax.find_orbit(SYSTEM, START, max_iterations=3)  # type: ignore[call-arg]
+
+
+class Toppling(nsjax.System):
+    """A pendulum; beside its upper rest the variational equation takes more steps than the solution."""
+
+    unit: float = 1.0
+
+    def vector_field(self, t, y, s):
+        return Motion(y.v, -self.unit * jnp.sin(y.x / self.unit))
+
+
+def test_a_fundamental_matrix_that_takes_too_many_steps():
+    system, start, options = Toppling(), Motion(3.14, 0.0), dict(rtol=1e-10, atol=1e-10)
+    steps = int(nsjax.solve(system, 0.0, 10.0, start, solver=dfx.Dopri8(), **options).stats["num_steps"])
+    matrix = nsjax.fundamental_matrix(system, 0.0, 10.0, start, max_steps=steps, throw=False, **options)
+    assert np.all(np.isnan(matrix))
+    with pytest.raises(nsjax.SolveError, match="max_steps"):
+        nsjax.fundamental_matrix(system, 0.0, 10.0, start, max_steps=steps, **options)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_a_fundamental_matrix_does_not_depend_on_units(unit):
+    want = nsjax.fundamental_matrix(Toppling(), 0.0, 10.0, Motion(3.0, 0.0))
+    atol = 1e-10 * min(1.0, unit)
+    matrix = nsjax.fundamental_matrix(Toppling(unit), 0.0, 10.0, Motion(3.0 * unit, 0.0), rtol=1e-10, atol=atol)
+    np.testing.assert_allclose(matrix, want, rtol=1e-7, atol=1e-8)
