@@ -240,7 +240,7 @@ def _place(
             admissible = admissible & (switch.rising(model.system, t, y, mode) <= 0)
             continue
 
-        def surface(t: Scalar, y: Y, k: int = k) -> list[Scalar]:
+        def surface(t: Scalar, y: Y, k: int = k) -> tuple[Scalar, ...]:
             return model.h(k, t, y)
 
         h, slack = jnp.min(jnp.stack(surface(t, y))), jnp.max(model.sizes(surface, t, y, jnp.zeros_like(t), size))

@@ -117,7 +117,9 @@ def _searched(shooting: Shooting, system: System, t0: Scalar, y0: Y, period: Sca
     at, unravel = jfu.ravel_pytree(guess)
     start = _unknowns(guess, first_period, autonomous)
     model = SwitchedSystem.forwards(still, t_still, guess)
-    field = section.normal if autonomous else ravel(model.flow(t_still, guess, at_start(model, t_still, guess, mode)))
+    field = (
+        ravel(model.flow(t_still, guess, at_start(model, t_still, guess, mode))) if section is None else section.normal
+    )
     sizes = shooting.sizes(at, field, shooting.period(at, start, still), autonomous)
 
     def residual(z: Array, parameters: tuple) -> Array:
