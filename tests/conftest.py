@@ -21,7 +21,7 @@ if jaxlib.__version__.startswith("0.10."):  # an unknown flag ends the process
     whole = "--xla_cpu_parallel_codegen_split_count=1"
     os.environ["XLA_FLAGS"] = f"{quick} {whole} {os.environ.get('XLA_FLAGS', '')}"
 # JAX writes the entries of its cache in place, and a second process that reads one meanwhile reports that it is cut off.
-# Each worker of pytest therefore has a folder of its own.
+# Each worker of pytest therefore has a folder of its own (pitfall 59).
 programs = os.environ.get("JAX_COMPILATION_CACHE_DIR") or pathlib.Path(__file__).parents[1] / ".jax_cache"
 jax.config.update(
     "jax_compilation_cache_dir", str(pathlib.Path(programs, os.environ.get("PYTEST_XDIST_WORKER", "main")))

@@ -1,4 +1,4 @@
-"""What the README and the docstrings say of a model works as it is printed there (issue 20.18)."""
+"""What the README and the docstrings say of a model works as it is printed there."""
 
 import pathlib
 import re

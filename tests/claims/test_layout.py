@@ -2,6 +2,7 @@
 
 import ast
 import pathlib
+import re
 import subprocess
 import sys
 
@@ -67,6 +68,18 @@ def test_modules_import_only_those_below(name):
 def test_choices_are_one_operation():
     """`jnp.where` is a function of its own in a program: see `select`."""
     assert [path.name for path in PACKAGE.rglob("*.py") if "jnp.where(" in path.read_text()] == ["_select.py"]
+
+
+def test_cited_pitfalls_are_listed():
+    """The rows of tests/PITFALLS.md, and the numbers that tests name. (Row 60 waits for its stress test.)"""
+    tests = pathlib.Path(__file__).parents[1]
+    listed = {int(n) for n in re.findall(r"^\| (\d+) \|", (tests / "PITFALLS.md").read_text(), re.MULTILINE)}
+    cited = set()
+    for path in tests.rglob("*.py"):
+        for numbers in re.findall(r"[Pp]itfalls?[ _](\d+(?:(?:, | and )\d+)*)", path.read_text()):
+            cited |= {int(n) for n in re.findall(r"\d+", numbers)}
+    assert cited <= listed
+    assert listed - cited <= {60}
 
 
 def test_importing_is_light_and_changes_nothing():

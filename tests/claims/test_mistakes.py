@@ -1,5 +1,5 @@
-"""Forty mistakes, each told in one line that names the argument, the value or the place, and the remedy (issue 20.14
-and 20.15); without a compilation where the numbers are known."""
+"""Forty mistakes, each told in one line that names the argument, the value or the place, and the remedy,
+without a compilation where the numbers are known."""
 
 from typing import Any, NamedTuple
 
@@ -267,7 +267,7 @@ def test_under_jit_and_in_batches():
 
 
 def test_printed():
-    """Issue 20.16: every result prints itself in a few lines, batched or not."""
+    """Every result prints itself in a few lines, batched or not."""
     sol = run(t1=90.0, y0=Motion(2.5, 0.0))
     assert str(sol.result).endswith("<successful>")
     assert [event.t for event in sol.events[-2:]] == [event.t for event in sol.events][-2:] and not sol.events[99:]

@@ -1,4 +1,4 @@
-"""Issue 20.16: every result prints itself in a few lines, in lists and notebooks too, batched or not, and never fails."""
+"""Every result prints itself in a few lines, in lists and notebooks too, batched or not, and never fails."""
 
 import html
 

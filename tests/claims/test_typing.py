@@ -1,4 +1,4 @@
-"""What a user's type checker sees (issue 20.19): no errors in a model of theirs, and the types of states that come out."""
+"""What a user's type checker sees: no errors in a model of theirs, and the types of states that come out."""
 
 import json
 import os
@@ -152,7 +152,7 @@ def test_types_are_shipped():
 
 
 def test_one_version_everywhere():
-    """Issue 20.19: the package's own is that of its metadata (`tool.hatch.version`) and of the citation."""
+    """The package's own is that of its metadata (`tool.hatch.version`) and of the citation."""
     citation = (ROOT / "CITATION.cff").read_text()
     assert re.search(r"^version: (.*)$", citation, re.MULTILINE)[1] == nsjax.__version__
     assert 'path = "nsjax/_version.py"' in (ROOT / "pyproject.toml").read_text()

@@ -143,7 +143,7 @@ def damped_period(v_dr, c=0.1, slip=1.0, stick=2.0):
 
 @pytest.mark.slow
 def test_other_parameters_than_the_gallerys_are_searched_from_nothing(tmp_path, monkeypatch):
-    """Issue 20.17: the gallery's period, 12.635, is that of twice this orbit, more or less."""
+    """The gallery's period, 12.635, is that of twice this orbit, more or less."""
     told = ("--set", "v_dr=0.5", "--y0", "x=2.5,v=0")
     status, out, err = run("orbit", "6.7", *told, "--json", "-")
     assert status == 0, err
@@ -264,7 +264,7 @@ def test_mistakes_with_a_file(thermostat, name, argv, words):
 
 
 def test_files_are_checked_before_the_work(monkeypatch):
-    """Issue 20.17."""
+    """A command that cannot write its result ends before it has computed for minutes."""
     monkeypatch.setattr(command, "load", lambda *args: pytest.fail("began"))
     monkeypatch.setattr("tempfile.TemporaryFile", lambda dir: open("/proc/nothing/here", "w"))
     for argv in ("run 3.4 --out pictures", "orbit 3.4 --json made/numbers.json"):
@@ -290,7 +290,7 @@ def test_json_makes_its_folder(tmp_path, monkeypatch):
 
 
 def test_a_file_with_one_model_needs_no_name(thermostat, tmp_path, monkeypatch):
-    """Issue 20.17: classes count, be there a base or an instance of it."""
+    """Classes count, be there a base or an instance of it."""
     seen = []
     monkeypatch.setattr(_search, "find_orbit", lambda system, *args, **kwargs: seen.append(system))
     path, _, _ = thermostat.rpartition(":")
@@ -335,7 +335,7 @@ def test_a_file_that_is_meant(thermostat, monkeypatch):
     ],
 )
 def test_a_mistake_in_the_model_is_a_short_report(thermostat, old, new, line, words):
-    """Issue 20.17: the user's own line, whatever it called, and no page of tracebacks."""
+    """The user's own line, whatever it called, and no page of tracebacks."""
     path = pathlib.Path(thermostat.rpartition(":")[0])
     path.write_text(THERMOSTAT.replace("import jax.numpy as jnp", "import numpy as np").replace(old, new))
     number = next(i for i, text in enumerate(path.read_text().splitlines(), 1) if line in text)
@@ -351,7 +351,7 @@ def test_a_mistake_in_the_model_is_a_short_report(thermostat, old, new, line, wo
 
 
 def test_an_error_within_a_program_is_one_line(tmp_path):
-    """Issue 20.17: equinox would put the stack of the compiler around it."""
+    """Equinox would put the stack of the compiler around it."""
     (tmp_path / "ball.py").write_text(
         "import nsjax\n"
         "class Ball(nsjax.System):\n"
@@ -369,7 +369,7 @@ def test_an_error_within_a_program_is_one_line(tmp_path):
 
 
 def test_version(capsys):
-    """Issue 20.17."""
+    """The version is printed on the standard output, with exit status 0."""
     assert run("--version") == (0, f"nsjax {nsjax.__version__}\n", "")
 
 
@@ -429,7 +429,7 @@ def test_options_reach_the_search(monkeypatch):
     ],
 )
 def test_advice_names_options(result, words):
-    """Issue 20.17: an error names what can be changed from the command line."""
+    """An error names what can be changed from the command line."""
     said = advice(getattr(nsjax.RESULTS, result))
     assert re.search(words, said) and not re.search(r"`(y0|period|order|mode)`|max_steps|max_events", said)
 

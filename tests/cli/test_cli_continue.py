@@ -89,7 +89,7 @@ def test_special_points_are_told_once(continued):
     assert None in special["multipliers"][1]
     assert special["count"] == [[1, 1], []] and special["crossings"] == []
     assert special["transition"] == branch.special[0].transition and special["surfaces"] == ["belt"]
-    # Issue 20.17: which branches meet there.
+    # Which branches meet there.
     halves = special["halves"]
     assert [(h["side"], h["laps"]) for h in halves] == [(-1, 1), (-1, 1)]
     assert sorted(h["stable"] for h in halves) == [False, True]

@@ -107,7 +107,7 @@ def timed(*words, **environment):
 
 @pytest.mark.slow
 def test_never_silent_for_more_than_two_seconds(tmp_path):
-    """Issue 26.7, in a cache that is empty. (Where other processes take all cores, a thread may be late.)"""
+    """The progress lines go on while programs are compiled, in a cache that is empty. (Where other processes take all cores, a thread may be late.)"""
     cache = tmp_path / "cache"
     found = timed("run", "3.4", "--out", tmp_path, JAX_COMPILATION_CACHE_DIR=str(cache))
     assert max(gap for gap, _ in found) < 2.0, found

@@ -301,7 +301,7 @@ def test_start_that_sticks():
 
 @pytest.mark.slow
 def test_end_in_a_continuum():
-    """Below A = 1 friction holds the mass for ever, at every |x| < 1 - A (issue 20.12)."""
+    """Below A = 1 friction holds the mass for ever, at every |x| < 1 - A."""
 
     class Dry(nsjax.System):
         A: float = 1.3

@@ -303,7 +303,7 @@ def test_mistakes(wall, change, message):
     ],
 )  # fmt: skip
 def test_another_parameter_is_no_new_program(name, system, start, intervals, request):
-    """Issue 22: of one parameter, or of two."""
+    """One parameter, or two, are changed without a compilation (pitfall 31)."""
     fold, orbit = fold_of(request.getfixturevalue(name)), orbit_of(system, start)
     of, one, other = intervals
     continue_orbit(system, orbit, of, intervals[of])  # tests before this one may have been told to forget

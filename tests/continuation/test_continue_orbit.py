@@ -143,7 +143,7 @@ def test_forced_stick_slip(belt):
     closed, *others = belt.branches
     assert "closed" in " ".join(closed.ends) and len(closed.special) == 6
     assert sorted(int(o.orders[0]) for o in others) == [4, 8]
-    # Issue 20.4 and pitfall 41: by parabolas through samples 2.2e-3 too low on VI, and 5e-4 on VIII.
+    # Pitfall 41: by parabolas through samples 2.2e-3 too low on VI, and 5e-4 on VIII.
     for branch in others:
         for i in np.linspace(1, len(branch) - 2, 3).astype(int):
             orbit = branch.orbit(i)

@@ -159,7 +159,7 @@ def test_the_twins_of_a_symmetry_have_equal_multipliers(buck):
 @pytest.mark.filterwarnings("ignore:There are more than `max_branches`")
 @pytest.mark.parametrize("seed", [2, 3])  # of which the branches have smooth special points
 def test_named_points_have_their_multipliers(seed):
-    """Along cascades of a ball in a capsule, beside many grazings."""
+    """Pitfall 58: along cascades of a ball in a capsule, beside many grazings."""
     rng = np.random.default_rng(seed)
     system = BallInCapsule(
         *map(jnp.asarray, (0.3, rng.uniform(0.05, 0.2), rng.uniform(0.4, 0.7), rng.uniform(0.2, 0.4)))

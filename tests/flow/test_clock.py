@@ -1,4 +1,4 @@
-"""Functions of time that jump (issue 20.2; pitfalls 12 and 36): ticks of a clock are met exactly, and what is not
+"""Functions of time that jump (pitfalls 12 and 36): ticks of a clock are met exactly, and what is not
 declared is found."""
 
 import functools
@@ -323,7 +323,7 @@ class Ramp(NamedTuple):
 
 @pytest.mark.slow
 def test_margin_at_a_tick():
-    """Issue 20.8: a comparator whose carrier falls back just before it is reached, or just beyond, as it may be."""
+    """A comparator whose carrier falls back just before it is reached, or just beyond, as it may be."""
 
     class Comparator(nsjax.System):
         def vector_field(self, t, y, s):
@@ -344,7 +344,7 @@ def test_margin_at_a_tick():
 
 @pytest.mark.slow
 def test_exponential_refuses_beyond_an_event_too():
-    """Issue 20.2: what it cannot step exactly it refuses, also where an event cuts the step short."""
+    """What it cannot step exactly it refuses, also where an event cuts the step short."""
 
     class Kick(nsjax.System):
         def vector_field(self, t, y, s):

@@ -1,4 +1,4 @@
-"""Several friction elements on one velocity, issue 20.9 and pitfall 37: only the sum of their forces is determined, so that
+"""Several friction elements on one velocity, pitfall 37: only the sum of their forces is determined, so that
 they must move as one element does whose strength is the sum of theirs."""
 
 import functools

@@ -410,7 +410,7 @@ class Balls(nsjax.System):
 
 
 def test_where_the_order_of_declaration_decides_the_solution_is_not_unique():
-    """Impacts on both sides of a ball at one instant: unique exactly where the order of declaration changes nothing."""
+    """Pitfall 55: impacts on both sides of a ball at one instant: unique exactly where the order of declaration changes nothing."""
     cases = {
         "from both sides": ([0.0, 2.0, 4.0], [1.0, 0.0, -1.0]),
         "both gaps close, one ball at rest": ([0.0, 2.0, 4.0], [1.0, 0.5, 0.0]),
@@ -557,7 +557,7 @@ def pressed(F, x, v, solver=None):
 
 @pytest.mark.parametrize("solver", [None, nsjax.Taylor()])
 def test_friction_along_the_normal_of_a_contact(solver):
-    """The contact bears the load while it rests, and friction holds the mass when it has opened."""
+    """Pitfall 56: the contact bears the load while it rests, and friction holds the mass when it has opened."""
     run = jax.jit(lambda *at: jax.jacfwd(pressed, has_aux=True)(*at, solver))
     slope, sol = run(3.0, 1.0, 0.0)
     np.testing.assert_allclose(sol.events.t[: int(sol.events.num)], [np.pi, np.pi + np.arcsin(1 / 3)], rtol=1e-9)

@@ -1,4 +1,4 @@
-"""Dense output and save times (issue 20.1)."""
+"""Dense output and save times."""
 
 import diffrax as dfx
 import jax
@@ -123,7 +123,7 @@ class Ramp(nsjax.System):
     ],
 )
 def test_events_at_the_end(solver):
-    """Issue 20.13, pitfall 9: an event exactly at the end is logged, and the end moves with the time that is asked for."""
+    """Pitfall 9: an event exactly at the end is logged, and the end moves with the time that is asked for."""
 
     def ends(t1):
         sol = nsjax.solve(Ramp(), 0.1, t1, Motion(0.1, 0.0), solver=solver)
@@ -139,7 +139,7 @@ def test_events_at_the_end(solver):
 
 @pytest.mark.slow
 def test_orbit_based_on_an_event():
-    """Issue 20.5, pitfall 44: with its base point exactly where it stops sticking, an orbit has the multipliers that it
+    """Pitfall 44: with its base point exactly where it stops sticking, an orbit has the multipliers that it
     has elsewhere."""
     exact = 10 + np.pi + 2 * np.arctan(0.2)
     orbit = nsjax.find_orbit(BELT, Motion(2.0, 0.2), period=exact, solver=dfx.Tsit5())
@@ -172,7 +172,7 @@ class Near(nsjax.System):
 
 
 def test_margin():
-    """Issue 20.8, pitfall 45: how near the solution came to an event that did not happen, in units of the tolerance."""
+    """Pitfall 45: how near the solution came to an event that did not happen, in units of the tolerance."""
     run = jax.jit(lambda gap: nsjax.solve(Near(gap=gap), 0.0, 10.0, Motion(0.7, 0.0)))
     for gap in (1e-4, 1e-6, 1e-7):
         np.testing.assert_allclose(run(gap).margin, gap / (1e-8 * (1 + 1.3)), rtol=0.1)
@@ -182,7 +182,7 @@ def test_margin():
 
 
 def test_margin_beside_an_event():
-    """Issue 20.8: also where another surface is met in the same step, before or behind."""
+    """Also where another surface is met in the same step, before or behind."""
 
     class Two(nsjax.System):
         at: float = 1.2

@@ -265,7 +265,7 @@ class Pressed(nsjax.System):
 
 @pytest.mark.slow
 def test_sticking_where_the_forcing_turns():
-    """Issue 20.11, pitfall 40: the forces cancel while it sticks, and their rounding is judged by them."""
+    """Pitfall 40: the forces cancel while it sticks, and their rounding is judged by them."""
     rng = np.random.default_rng(0)
     rows = {
         name: rng.uniform(*ends, 127) for name, ends in dict(c=(0.1, 3), a=(0.1, 2), w=(0.3, 4), f=(0.5, 3)).items()

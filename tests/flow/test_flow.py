@@ -185,7 +185,7 @@ def test_backwards_in_a_time_that_matters():
 
 
 def test_reset_without_an_inverse_is_not_run_backwards():
-    """Issue 20.3: the state before a reset is not told by the one after it."""
+    """The state before a reset is not told by the one after it."""
 
     class Valve(nsjax.System):
         def vector_field(self, t, y, s):

@@ -60,6 +60,7 @@ class Dose(nsjax.System):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_narrow_window_is_met(solver):
+    """Pitfall 49."""
     y1 = nsjax.solve(Dose(), 0.0, 300.0, 0.0, solver=SOLVERS[solver]).y1
     np.testing.assert_allclose(y1, 3e4 * (np.exp(-0.95) - np.exp(-1.0)), rtol=1e-8)  # 565.847468
 
@@ -186,7 +187,7 @@ def test_derivatives_by_an_amplitude_of_zero_in_a_sweep():
 
 @pytest.mark.parametrize("solver", [dfx.Tsit5(), dfx.Dopri8(), nsjax.Taylor()])
 def test_derivatives_by_an_amplitude_of_zero(solver):
-    """A rigid model has no time scale of its own: its steps have that of what drives the derivative."""
+    """Pitfall 50: a rigid model has no time scale of its own: its steps have that of what drives the derivative."""
     want = np.broadcast_to([np.sin(10.0) / 2, np.sin(15.0) / 3], (4, 2))
     np.testing.assert_allclose(slopes(TwoWaves, solver, AMPLITUDES), want, atol=1e-6)
 
@@ -217,6 +218,7 @@ class Loaded(nsjax.System):
 
 
 def test_two_frequencies_beside_a_static_load():
+    """Pitfall 48."""
     loads = jnp.array([1.0, 3e3])
 
     def end(load):
@@ -226,7 +228,7 @@ def test_two_frequencies_beside_a_static_load():
 
 
 def test_friction_in_the_sliding_velocity_is_caught_where_it_should_be():
-    """The step that ends in the event looks beyond the surface, where |v_rel| is that of the mode."""
+    """Pitfall 52: the step that ends in the event looks beyond the surface, where |v_rel| is that of the mode."""
     start, stop = Motion(-1.09655, 0.020415), 2.2
     runs = [
         jax.jit(lambda m, s=s: nsjax.solve(m, 0.0, stop, start, solver=s, throw=False))(Stribeck())
@@ -291,6 +293,8 @@ def test_orbits_of_a_square_wave_with_and_without_a_clock(square_orbit):
 
 
 def test_a_period_that_is_not_the_period_of_the_forcing():
+    """Pitfall 57."""
+
     class Wrong(nsjax.System):
         def vector_field(self, t, y, s):
             return Motion(y.v, -y.x - 0.1 * y.v + jnp.cos(t))

@@ -1,4 +1,4 @@
-"""The flow against exact solutions of random piecewise-affine systems with functions of time that jump (issue 20: clocks,
+"""The flow against exact solutions of random piecewise-affine systems with functions of time that jump (clocks,
 square waves, sawteeth, tables, in fields and guards): same events, times, states, modes, derivatives, both ways in time."""
 
 import functools

@@ -1,4 +1,4 @@
-"""The flow against 36-digit solutions of random systems whose fields and guards are not affine (issue 20: polynomials,
+"""The flow against 36-digit solutions of random systems whose fields and guards are not affine (polynomials,
 sines, products; 3 to 6 states, up to 5 switches): same events, times, states, modes, or a status that says no."""
 
 import collections

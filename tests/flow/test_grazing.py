@@ -69,7 +69,7 @@ def test_square_root_is_not_floored():
 
 @pytest.mark.parametrize("method", ["variational", pytest.param("autodiff", marks=pytest.mark.slow)])
 def test_fundamental_matrix_through_grazing(method):
-    """Issue 20.5: not defined beyond a tangential event, and said so; defined before it."""
+    """Not defined beyond a tangential event, and said so; defined before it."""
     args = dict(method=method, solver=dfx.Tsit5(), stepsize_controller=pid(1e-12))
     with pytest.raises(Exception, match="met tangentially"):
         nsjax.fundamental_matrix(Touch(-1e-12), -np.pi, 3.0, Motion(-1.0, 0.0), ts=[-1.0, 3.0], **args)
@@ -80,7 +80,7 @@ def test_fundamental_matrix_through_grazing(method):
 
 
 def test_saltation_at_a_tangency_is_infinite():
-    """Issue 20.5: in the entries that depend on when the surface is met; the others stay as they are."""
+    """In the entries that depend on when the surface is met; the others stay as they are."""
 
     class Push(Touch):
         def vector_field(self, t, y, s):

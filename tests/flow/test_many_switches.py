@@ -125,7 +125,7 @@ def test_lanes_and_second_derivatives():
 
 @pytest.mark.slow
 def test_programs_grow_little():
-    """Twice as many switches make a third more of a program, derivatives included; one by one they made it twice as
+    """Pitfall 47: twice as many switches make a third more of a program, derivatives included; one by one they made it twice as
     large."""
 
     def end(v, n):

@@ -65,7 +65,7 @@ def crowded(case, path):
 
 @pytest.mark.parametrize("m", [1, *(pytest.param(m, marks=pytest.mark.slow) for m in (2, 3, 5))])
 def test_every_assignment(m):
-    """Issue 20.7 and 20.10, pitfalls 34, 38 and 39: the mode at the start and after each arrival, `unique` and the status,
+    """Pitfalls 34, 38 and 39: the mode at the start and after each arrival, `unique` and the status,
     against an oracle that tries all assignments: thousands of random fields, of which hundreds have several solutions,
     and hundreds are held by a surface that would repel alone. (Of five switches, where up to four are at their surfaces:
     batches of them came to a standstill, and one that had to be found by trying was missed.)"""
@@ -102,7 +102,7 @@ def test_every_assignment(m):
         assert seen["repels alone"] >= 50 and seen["arrivals"] >= 1000
 
 
-# The pair of issue 20.7: y' = (p_0 - s_0 + g s_1, p_1 + g s_0 - s_1) from (-0.1, 0), with a static point of the first alone.
+# A pair, y' = (p_0 - s_0 + g s_1, p_1 + g s_0 - s_1) from (-0.1, 0), with a static point of the first alone.
 PAIRS = {
     "two modes": ((1.0, 0.5, 0.95, 2.1), False, (0, 1)),
     "one mode": ((-0.1, 1.34, 0.6, 1.2), True, (0, 1)),
@@ -111,7 +111,7 @@ PAIRS = {
 
 @pytest.mark.parametrize("name", PAIRS)
 def test_unique_by_the_mode_taken(name):
-    """Issue 20.7, pitfall 39: with both held, the first guess, |λ| > b; with the second let go the first can be held, and
+    """Pitfall 39: with both held, the first guess, |λ| > b; with the second let go the first can be held, and
     in one of two cases let go too."""
     (p0, p1, g, b), unique, mode = PAIRS[name]
     case = Linear(np.array([p0, p1]), np.array([[-1, g], [g, -1]]), np.array([b, 1.0]), np.array([-0.1, 0.0]))
@@ -124,7 +124,7 @@ def test_unique_by_the_mode_taken(name):
 @pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
 @pytest.mark.parametrize("y0", [(0.0, 0.0), (0.3, -0.1), (-0.2, 0.05), (0.0, 0.3), (0.2, 0.0)])
 def test_held_by_two_that_would_not_hold_alone(y0, unit):
-    """Issue 20.10, pitfall 38: y' = (0.5 a + 1.9 b, -0.5 a - 1.2 b). The first surface repels alone (0.5 > 0), and the second
+    """Pitfall 38: y' = (0.5 a + 1.9 b, -0.5 a - 1.2 b). The first surface repels alone (0.5 > 0), and the second
     does while the first is slid on (-1.2 + 0.5 * 1.9 / 0.5 > 0); but all solutions come to the origin and stay there."""
     M = unit * np.array([[0.5, 1.9], [-0.5, -1.2]])
     system = Rubbing(jnp.zeros(2), jnp.asarray(M), jnp.ones(2))
@@ -136,8 +136,8 @@ def test_held_by_two_that_would_not_hold_alone(y0, unit):
 
 @pytest.mark.slow
 def test_many_surfaces():
-    """Issue 20.7 and 20.10 for six surfaces, of which not every assignment is tried: two that are held as above, and two pairs
-    of issue 20.7, of which one may have two solutions; the order of declaration is no matter."""
+    """Of six surfaces not every assignment is tried: two that are held as above, and two pairs of which the first guess is
+    wrong (pitfall 39), of which one may have two solutions; the order of declaration is no matter."""
     M, p, b = np.zeros((6, 6)), np.zeros(6), np.ones(6)
     M[:2, :2] = [[0.5, 1.9], [-0.5, -1.2]]
     for last, unique in (("one mode", True), ("two modes", False)):

@@ -83,7 +83,7 @@ def accumulation(v, a, b, r):
 
 @pytest.mark.parametrize("solver", [None, nsjax.Taylor()])
 def test_a_reset_on_a_surface_crossed_from_either_side(solver):
-    """Half a turn takes π whatever the amplitude: after the crossings at π/2 and 3π/2 the solution is r² cos t."""
+    """Pitfall 53: half a turn takes π whatever the amplitude: after the crossings at π/2 and 3π/2 the solution is r² cos t."""
 
     def end(r):
         return solve(Crossing(r), 0.0, 6.0, Motion(1.0, 0.0), solver=solver, rtol=1e-10, atol=1e-10)
@@ -169,7 +169,7 @@ def test_backwards_by_the_inverse():
 
 @pytest.mark.parametrize("r", [0.5, 0.9])
 def test_resets_that_accumulate(r):
-    """Sides that differ make flights of different lengths in turn; a sign and a counter have no limit."""
+    """Pitfall 54: sides that differ make flights of different lengths in turn; a sign and a counter have no limit."""
     a, b, v = 1.0, 3.0, 0.7
     args = dict(rtol=1e-11, atol=1e-11, throw=False, max_events=400)
     crossed = solve(Falling(a, b, r), 0.0, 90.0, Motion(0.0, v), **args)

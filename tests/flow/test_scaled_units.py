@@ -69,6 +69,7 @@ def differences(key, case):
 @pytest.mark.parametrize("case", UNITS)
 @pytest.mark.parametrize("key", QUICK)
 def test_other_units(key, case):
+    """Pitfalls 27, 51."""
     alike, late, off = differences(key, case)
     assert all(alike), alike
     assert late < ERROR and off < 1, (late, off)

@@ -1,4 +1,4 @@
-"""Sliding through a two-fold, issue 20.6 and pitfall 39: where the fields on both sides are tangent to the surface at one
+"""Sliding through a two-fold, pitfall 39: where the fields on both sides are tangent to the surface at one
 point, n · f⁺ = n · f⁻ = 0, sliding passes from where the surface attracts to where it repels. From there on a solution
 may leave at any time, to either side: none is unique."""
 

@@ -11,7 +11,7 @@ from nsjax._numerics._linalg import linear_solve
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("m", [1, 2, 3, 4, 6])
 def test_linear_solve(m, seed):
-    """Pitfall 27, and issue 20.20: also where rows and columns have units of very different size; zeros on the
+    """Pitfall 27, and also where rows and columns have units of very different size; zeros on the
     diagonal; derivatives.
 
     Elimination solves (A + ΔA) x = b with |ΔA| <= 3 m eps P |L| |U|, which for small matrices in units that are meant

@@ -117,7 +117,7 @@ def test_a_part_that_is_not_known():
 
 @pytest.mark.slow
 def test_orbit_of_twelve_periods():
-    """Issue 20.4, pitfall 41: an arc with six peaks of nearly one height. Of 65 samples the largest stands beside
+    """Pitfall 41: an arc with six peaks of nearly one height. Of 65 samples the largest stands beside
     another one, 2.244732 m; the reference is a fine table of the solution and the polynomial through its largest."""
     system = nsjax.gallery.ForcedStickSlip(omega=1.695)
     how = dict(solver=dfx.Tsit5(), stepsize_controller=pid(1e-12), max_steps=8192)

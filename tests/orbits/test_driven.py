@@ -20,7 +20,7 @@ QUICK = dict(solver=diffrax.Tsit5())  # of half the size of the default; tests o
 
 
 def test_a_new_number_is_no_new_program():
-    """Issue 22: neither another parameter nor another guess is compiled for."""
+    """Neither another parameter nor another guess is compiled for."""
     find_orbit(gallery.StickSlip(), Motion(2.02, 0.0), period=13.54, **QUICK)
     with compilations() as compiled:
         orbit = find_orbit(gallery.StickSlip(v_dr=0.25), Motion(2.0, 0.1), period=12.0, **QUICK)
@@ -30,7 +30,7 @@ def test_a_new_number_is_no_new_program():
 
 
 def test_results_are_read_without_a_program_for_each_operation():
-    """Issue 22: eager operations are programs too, of some 30 ms each. Events, prints and dense output need none, or
+    """Eager operations are programs too, of some 30 ms each. Events, prints and dense output need none, or
     one."""
     sol = nsjax.solve(gallery.StickSlip(), 0.0, 20.0, Motion(2.5, 0.0), saveat=diffrax.SaveAt(dense=True))
     with compilations() as compiled:

@@ -307,7 +307,7 @@ def two_tones(t, c=0.3):
 
 @pytest.mark.slow
 def test_maximum_of_many_peaks():
-    """Issue 20.4 and pitfall 41: no fixed number of samples decides which of a hundred peaks is the largest."""
+    """Pitfall 41: no fixed number of samples decides which of a hundred peaks is the largest."""
     orbit = find_orbit(TwoTones(), Motion(0.0, 0.3), max_steps=20000)
     ts = np.linspace(0, 200 * np.pi, 2_000_001)
     for sign in (1, -1):
@@ -499,7 +499,7 @@ def test_the_mode_of_a_relay_comes_back():
     off = eqx.filter_jit(lambda y: find_orbit(Feedback(), y, t0=t0, mode={"r": 0}, throw=False, **METHOD))(guess)
     assert not bool(nsjax.is_okay(off.result))
     assert int(find_orbit(Feedback(), guess, t0=t0, mode={"r": 0}, **METHOD).mode[0]) == 1
-    # Issue 20.12: it is found without being told.
+    # It is found without being told.
     alone = find_orbit(Feedback(), guess, t0=t0, **METHOD)
     assert int(alone.mode[0]) == 1
     np.testing.assert_allclose(alone.y0, found.y0, rtol=1e-9)
@@ -526,7 +526,7 @@ class Thermostat(nsjax.System):
 @pytest.mark.parametrize("heat", [1.5, 3.0])
 @pytest.mark.parametrize("period", [None, 0.5])
 def test_an_orbit_within_the_hysteresis(heat, period):
-    """Issue 20.12: the base point lies in the longer arc, whichever mode that is of. Both in closed form."""
+    """The base point lies in the longer arc, whichever mode that is of. Both in closed form."""
     on, off = np.log((heat - 0.9) / (heat - 1.1)), np.log(1.1 / 0.9)
     for method in ("shooting", "segments"):
         orbit = find_orbit(Thermostat(heat), jnp.asarray(1.0), period=period, method=method, **METHOD)
@@ -566,7 +566,7 @@ class Driven(Held):
     ids=["at rest", "comes to rest"],
 )
 def test_a_continuum_is_named(system, guess, y0):
-    """Issue 20.12: every x that friction can hold is an equilibrium, or an orbit."""
+    """Every x that friction can hold is an equilibrium, or an orbit."""
     orbit = find_orbit(system, y0, throw=False, **guess, **METHOD)
     assert orbit.result == RESULTS.orbit_sticks_for_ever and not bool(nsjax.is_okay(orbit.result))
 

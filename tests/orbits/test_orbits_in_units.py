@@ -52,6 +52,7 @@ def check(key, case, method):
 @pytest.mark.parametrize("case", UNITS)
 @pytest.mark.parametrize("key", QUICK)
 def test_orbits(key, case):
+    """Pitfalls 27, 51."""
     check(key, case, "shooting")
 
 

@@ -286,7 +286,7 @@ class Ceiling(nsjax.System):
 
 @pytest.mark.slow
 def test_no_sample_decides_whether_an_orbit_is_admissible():
-    """Issue 20.4 and pitfall 41: a surface is passed at one of a hundred peaks, between any 65 samples."""
+    """Pitfall 41: a surface is passed at one of a hundred peaks, between any 65 samples."""
     method = dict(stepsize_controller=pid(1e-12), max_steps=20000, max_events=1)
     ts = np.linspace(0, 200 * np.pi, 2_000_001)
     x = sum((0.1 * np.exp(1j * w * ts) / (1 - w**2 + 0.3j * w)).real for w in (1, 0.97))

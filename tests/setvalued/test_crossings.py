@@ -285,7 +285,7 @@ def test_eigenvalues_that_stay_on_the_axis(change):
 
 
 def test_a_crossing_beside_a_defective_zero():
-    """Issue 20.20: the last digits of the entries move roots by the square root of rounding where two zeros that
+    """The last digits of the entries move roots by the square root of rounding where two zeros that
     stay are defective. They are one crossing with that of the third, not several."""
     rng, eps = np.random.default_rng(0), np.finfo(float).eps
 
