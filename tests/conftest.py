@@ -54,8 +54,34 @@ def size():
     return int(pathlib.Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
+class Compilations:
+    """Listens to what is compiled while a file of tests is imported: a file that fails then would hide all others."""
+
+    def __init__(self):
+        self.file, self.files = None, set()
+
+    def heard(self, event, seconds, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            self.files.add(self.file)
+
+
+collecting = Compilations()
+jax.monitoring.register_event_duration_secs_listener(collecting.heard)
+
+
+def pytest_make_collect_report(collector):
+    if isinstance(collector, pytest.Module):
+        collecting.file = collector.nodeid
+        jax.clear_caches()  # so that one file's program is not there for the next
+
+
 def pytest_collection_finish():
-    """What is imported by then stays, and need not be looked through again."""
+    jax.monitoring.unregister_event_duration_listener(collecting.heard)
+    if collecting.files:
+        raise pytest.UsageError(
+            f"These files compile while tests are collected: {', '.join(sorted(collecting.files))}."
+        )
+    # What is imported by then stays, and need not be looked through again.
     gc.collect()
     gc.freeze()
 

@@ -104,7 +104,7 @@ class Scene(System):
         for name, effect in others.items():
             effect.check(name, self.coordinates, others)
         with jax.ensure_compile_time_eval():
-            check_mass(self._entries, kind(*[jnp.zeros(())] * len(kind._fields)), not self._mass_varies)
+            check_mass(self._entries, kind(*[np.zeros(())] * len(kind._fields)), not self._mass_varies)
         periods = self._periods
         self.multiple = multiple_of(periods) if periods else 1
 

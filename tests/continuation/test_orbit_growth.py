@@ -170,7 +170,7 @@ class Pitchfork(nsjax.System):
         return Plane(self.mu * y.q - jnp.abs(y.q) * y.q)
 
 
-@pytest.mark.parametrize("y", [None, Plane(jnp.zeros(1))])
+@pytest.mark.parametrize("y", [None, Plane(np.zeros(1))])
 def test_equilibria(tmp_path, y):
     system = Pitchfork()
     start = nsjax.find_equilibrium(system, Plane(jnp.zeros(1)))

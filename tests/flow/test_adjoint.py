@@ -1,5 +1,7 @@
 """Reverse mode: wherever forward mode works, by the whole Jacobian and by going back through the steps."""
 
+import functools
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -24,7 +26,7 @@ def stick_slip(p, adjoint, **kwargs):
     return jnp.concatenate([jnp.stack(sol.y1), sol.events.t[:2]])
 
 
-POINT = jnp.array([2.0, 0.0, 1.1, 0.2, 0.9])
+POINT = np.array([2.0, 0.0, 1.1, 0.2, 0.9])
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +62,10 @@ class Learned(nsjax.System):
         return self.ratio
 
 
-LAW, REST = eqx.partition(eqx.nn.MLP("scalar", "scalar", 2, 1, key=jax.random.key(0)), eqx.is_inexact_array)
+@functools.cache
+def network():
+    """Its numbers, and its structure."""
+    return eqx.partition(eqx.nn.MLP("scalar", "scalar", 2, 1, key=jax.random.key(0)), eqx.is_inexact_array)
 
 
 # In forward mode the error of the derivatives has a say in the choice of steps, and not with checkpoints.
@@ -70,17 +75,18 @@ FIXED = dict(solver=dfx.Heun(), stepsize_controller=dfx.ConstantStepSize(), dt0=
 def learned(p, adjoint):
     """Through slip, stick and slip again: the state at the end and the times of the events."""
     law, x, v_dr, ratio = p
-    system = Learned(eqx.combine(law, REST), v_dr, ratio)
+    system = Learned(eqx.combine(law, network()[1]), v_dr, ratio)
     sol = solve(system, 0.0, 10.0, Motion(x, 0.0), adjoint=adjoint, **FIXED, max_steps=512, max_events=16)
     return sol.y1.x, sol.y1.v, sol.events.t[:2]
 
 
-LEARNED = (LAW, *jnp.array([1.4, 0.3, 1.5]))
+def learned_point():
+    return network()[0], *jnp.array([1.4, 0.3, 1.5])
 
 
 @pytest.fixture(scope="module")
 def learned_forward():
-    return jax.jit(jax.jacfwd(lambda p: learned(p, dfx.ForwardMode())))(LEARNED)
+    return jax.jit(jax.jacfwd(lambda p: learned(p, dfx.ForwardMode())))(learned_point())
 
 
 @pytest.mark.slow  # (by default against closed forms, below)
@@ -88,7 +94,7 @@ def learned_forward():
 def test_reverse_is_forward(learned_forward, adjoint):
     """Sliding entry, static breakaway, event times; by initial state, parameters, and the numbers of a network, whose
     activation is a function that comes back with the solution's system."""
-    backward = jax.jit(jax.jacrev(lambda p: learned(p, ADJOINTS[adjoint])))(LEARNED)
+    backward = jax.jit(jax.jacrev(lambda p: learned(p, ADJOINTS[adjoint])))(learned_point())
     for law, *others in learned_forward:
         assert max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(law)) > 0.01
         assert all(np.any(np.abs(x) > 0.01) for x in others)

@@ -221,18 +221,18 @@ def test_flip_of_the_buck_converter(buck_at_20):
     np.testing.assert_allclose(flip.value, want, rtol=1e-9)
 
 
-TABLE = jnp.asarray([0.0, 2.0, -2.0, 1.5])
-EDGES = jnp.asarray([0.37, 0.9, 1.4])
+TABLE = np.asarray([0.0, 2.0, -2.0, 1.5])
+EDGES = np.asarray([0.37, 0.9, 1.4])
 STAIRS = {
     "floor": lambda t: jnp.floor(t / 0.37),
     "table": lambda t: jnp.take(TABLE, (t / 0.37).astype(int), mode="clip"),
     "integers": lambda t: (t / 0.37).astype(int).astype(float),
-    "one of several": lambda t: TABLE[jnp.argmax(jnp.stack([jnp.cos(t), jnp.sin(t)]))],
-    "search": lambda t: TABLE[jnp.searchsorted(EDGES, t)],
-    "digitize": lambda t: TABLE[jnp.digitize(t, EDGES)],
+    "one of several": lambda t: jnp.asarray(TABLE)[jnp.argmax(jnp.stack([jnp.cos(t), jnp.sin(t)]))],
+    "search": lambda t: jnp.asarray(TABLE)[jnp.searchsorted(EDGES, t)],
+    "digitize": lambda t: jnp.asarray(TABLE)[jnp.digitize(t, EDGES)],
     "piecewise": lambda t: jnp.piecewise(t, [t < 0.7, t >= 0.7], [0.0, 2.0]),
     "select": lambda t: jnp.select([t < 0.7, t < 1.4], [0.0, 2.0], -2.0),
-    "order": lambda t: TABLE[jnp.argsort(jnp.stack([t, 1.0 - t]))[0]],
+    "order": lambda t: jnp.asarray(TABLE)[jnp.argsort(jnp.stack([t, 1.0 - t]))[0]],
     "rounded": lambda t: jnp.round(t),
     "sawtooth": lambda t: t % 0.37,
     "loop": lambda t: jax.lax.while_loop(lambda c: c[0] > 0.4, lambda c: (c[0] - 0.4, c[1] + 1), (t, 0 * t))[1],
@@ -248,7 +248,7 @@ def test_spellings_of_a_jump():
         jnp.sin,
         jnp.abs,
         lambda t: jnp.max(jnp.stack([t, t**2])),
-        lambda t: jnp.linalg.solve(jnp.eye(2), t + TABLE[:2])[0],
+        lambda t: jnp.linalg.solve(jnp.eye(2), t + jnp.asarray(TABLE)[:2])[0],
     ):
         assert not any(jumps(fn, jnp.asarray(0.5)))
 

@@ -190,11 +190,11 @@ class Heated(nsjax.System):
 REST = Motion(0.0, 0.0)
 MODELS = {
     "section 6.6": (lambda w: gallery.Trilinear(omega=w), Motion(-0.9, 0.94)),
-    "friction, stop, wall": (Mixed, Motion(jnp.array([0.0, 0.5]), jnp.zeros(2))),
+    "friction, stop, wall": (Mixed, Motion(np.array([0.0, 0.5]), np.zeros(2))),
     "moving stop": (Moving, REST),
     "relays": (Heated, REST),
 }
-LANES = jnp.linspace(0.6, 2.4, 48)
+LANES = np.linspace(0.6, 2.4, 48)
 
 
 def sweeps(name):

@@ -58,8 +58,9 @@ class Linear(nsjax.System):
 def linear(A, b=0, a=0, w=1.0, ramp=False):
     """Of three states, so that all are one program: what comes after those of A stands still. Forces act on A's last."""
     n = len(A)
-    forces = [jnp.zeros(3).at[n - 1].set(x) for x in (b, a)]
-    return Linear(jnp.zeros((3, 3)).at[:n, :n].set(jnp.asarray(A)), *forces, jnp.asarray(w), ramp)
+    matrix, forces = np.zeros((3, 3)), np.zeros((2, 3))
+    matrix[:n, :n], forces[:, n - 1] = A, (b, a)
+    return Linear(matrix, *forces, np.asarray(w), ramp)
 
 
 @jax.jit

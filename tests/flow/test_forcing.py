@@ -80,10 +80,10 @@ class Written(nsjax.System):
 
 
 # A name: f, and the times at which it jumps or bends between 0 and 10.
-TENTHS = jnp.asarray([0.3, 1.0, -2.0, 0.5])
+TENTHS = np.asarray([0.3, 1.0, -2.0, 0.5])
 FORMS = {
     "floor": lambda t: jnp.floor(t / 0.7),
-    "an index": lambda t: TENTHS[(t / 1.3).astype(int) % 4],
+    "an index": lambda t: jnp.asarray(TENTHS)[(t / 1.3).astype(int) % 4],
     "two windows": lambda t: jnp.where((t > 1) & (t < 1.01), 2.0, 0.0) - jnp.where(jnp.abs(t - 6) < 0.02, 1.0, 0.0),
     "the sign of a sine": lambda t: jnp.sign(jnp.sin(2 * t + 0.3)),
     "half a wave": lambda t: jnp.maximum(jnp.cos(3 * t), 0.2),
@@ -165,7 +165,7 @@ class OneWave(TwoWaves):
         return self.F * jnp.cos(2 * t + self.G) - 0.1 * s.ground
 
 
-AMPLITUDES = jnp.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.2], [0.3, 0.4]])
+AMPLITUDES = np.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.2], [0.3, 0.4]])
 
 
 @functools.partial(jax.jit, static_argnames=("model", "solver"))

@@ -16,7 +16,7 @@ from nsjax.gallery import Motion, thesis
 
 N = 5  # of four blocks all guards would be searched
 STARTS = np.stack([2 * np.sin(1.0 + np.arange(N)), np.cos(3.0 * np.arange(N))])
-TS = jnp.linspace(0.0, 9.0, 19)
+TS = np.linspace(0.0, 9.0, 19)
 TIGHT = dict(stepsize_controller=diffrax.PIDController(rtol=1e-11, atol=1e-11))
 
 

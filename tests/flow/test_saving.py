@@ -14,7 +14,7 @@ from nsjax import gallery, Solution
 
 
 SYSTEM = gallery.StickSlip()
-TS = jnp.linspace(0.0, 20.0, 5)
+TS = np.linspace(0.0, 20.0, 5)
 
 
 @pytest.fixture(scope="module")

@@ -101,7 +101,7 @@ def test_both_at_once_are_refused_everywhere(call):
     "integers, floats",
     [
         (Motion(1, 0), Motion(1.0, 0.0)),
-        (Motion(jnp.asarray(1), 0.5), Motion(1.0, 0.5)),
+        (Motion(np.asarray(1), 0.5), Motion(1.0, 0.5)),
         (Motion(np.int32(1), np.int8(0)), Motion(1.0, 0.0)),
         (np.array([1, 0]), np.array([1.0, 0.0])),
     ],

@@ -467,7 +467,7 @@ def test_reduced_map_says_where_there_is_none():
 # Brute force.
 
 
-TWO = Motion(jnp.asarray([2.0, -1.0]), jnp.asarray([0.0, 3.0]))
+TWO = Motion(np.asarray([2.0, -1.0]), np.asarray([0.0, 3.0]))
 
 
 def settled(omega, starts=TWO, zeta=ZETA, **options):

@@ -13,7 +13,7 @@ def root(x):
     return left_over(x < 0, jnp.sqrt(jnp.abs(x))) if is_first_pass() else jnp.sqrt(jnp.abs(x))
 
 
-x = jnp.asarray([1.0, -4.0, 9.0])
+x = np.asarray([1.0, -4.0, 9.0])
 
 FUNCTIONS = {
     "called": root,

@@ -8,7 +8,7 @@ import pytest
 from nsjax._numerics._lane_cond import compact_cond
 
 
-X = jnp.linspace(0.1, 1, 100)
+X = np.linspace(0.1, 1, 100)
 
 
 @pytest.mark.parametrize("group", [48, 64])

@@ -46,8 +46,8 @@ def skipped(p):
     return compact_cond(p[0] > 0, value, (p,), p[0])
 
 
-P = jnp.array([0.3, 0.7])
-LANES = jnp.stack([P, 2 * P, -P])
+P = np.array([0.3, 0.7])
+LANES = np.stack([P, 2 * P, -P])
 WAYS = {
     "plain": (lambda fn: fn, P, 1),
     "jacfwd": (jax.jacfwd, P, 1),

@@ -8,7 +8,7 @@ import pytest
 from nsjax._numerics._jaxpr import dependence, is_affine, is_constant
 
 
-M = jnp.arange(1.0, 10.0).reshape(3, 3)
+M = np.arange(1.0, 10.0).reshape(3, 3)
 FUNCTIONS = {
     "entries": lambda y: jnp.stack([y[2], jnp.sin(y[0]), jnp.asarray(2.0)]),
     "parts": lambda y: jnp.concatenate([y[1:], y[:1] ** 2]),

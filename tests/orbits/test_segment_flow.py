@@ -21,7 +21,7 @@ from nsjax.system._parameter import FreeParameters
 from nsjax.system._system import arrays_of
 
 
-Y = Motion(jnp.asarray(0.3), jnp.asarray(-0.4))
+Y = Motion(np.asarray(0.3), np.asarray(-0.4))
 HOW = Integrator(dfx.Tsit5(), None, 4096).checked(float, (1e-12, 1e-6))
 
 

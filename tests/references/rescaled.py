@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import nsjax
+from nsjax import gallery
 from nsjax.system._clock import clock
 
 
@@ -55,6 +56,11 @@ UNITS = {  # of the state (None: of each component another one), of the time, an
     "slow": (1e6, 1e9, 1e-6),
     "mixed": (None, 1e3, 1e-3),
 }
+
+
+def is_forced(key):
+    """Whether a gallery entry declares a period, which is not worked out for this."""
+    return type(gallery.entry(key).system()).period is not nsjax.System.period
 
 
 def rescaled(system, like, case=None):

@@ -247,7 +247,7 @@ def test_several_at_once(finished, want, tmp_path):
     same(workers[0].result(), want)
 
 
-@pytest.mark.parametrize("order", [X, -jnp.asarray(X), np.zeros(len(X))])
+@pytest.mark.parametrize("order", [X, -np.asarray(X), np.zeros(len(X))])
 def test_in_another_order(finished, want, tmp_path, order):
     """Which is a matter of speed only."""
     same(again(finished, tmp_path, order=order).run().result(), want)

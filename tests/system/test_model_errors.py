@@ -181,7 +181,7 @@ ARGUMENTS = {
     "boolean": (dict(y0=Motion(True, 0.5)), TypeError, "`y0` must hold floating point numbers"),
     "complex": (dict(y0=Motion(1j, 0.5)), TypeError, "must be real.*real and imaginary part"),
     "times": (
-        dict(t1=jnp.asarray([1.0, 2.0])),
+        dict(t1=np.asarray([1.0, 2.0])),
         ValueError,
         r"`t1` must be a scalar, but has shape \(2,\); use `jax.vmap`",
     ),

@@ -182,7 +182,7 @@ class BlocksWritten(Blocks):
         return jnp.stack([h[0] * s.first, h[1] * s.second, jnp.abs(v[2] - self.v_dr)])
 
 
-BLOCKS = Motion(jnp.array([0.4, -0.3, 0.1]), jnp.array([0.2, 0.2, 0.25]))
+BLOCKS = Motion(np.array([0.4, -0.3, 0.1]), np.array([0.2, 0.2, 0.25]))
 
 
 @functools.partial(jax.jit, static_argnums=0)
