@@ -555,7 +555,7 @@ def pressed(F, x, v, solver=None):
     return sol.y1.x, sol
 
 
-@pytest.mark.parametrize("solver", [None, nsjax.Taylor()])
+@pytest.mark.parametrize("solver", [None, pytest.param(nsjax.Taylor(), marks=pytest.mark.slow)])
 def test_friction_along_the_normal_of_a_contact(solver):
     """Pitfall 56: the contact bears the load while it rests, and friction holds the mass when it has opened."""
     run = jax.jit(lambda *at: jax.jacfwd(pressed, has_aux=True)(*at, solver))

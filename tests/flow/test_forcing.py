@@ -185,14 +185,21 @@ def test_derivatives_by_an_amplitude_of_zero_in_a_sweep():
     np.testing.assert_allclose(nsjax.sweep(slope, AMPLITUDES), want, atol=1e-6)
 
 
-@pytest.mark.parametrize("solver", [dfx.Tsit5(), dfx.Dopri8(), nsjax.Taylor()])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        dfx.Tsit5(),
+        pytest.param(dfx.Dopri8(), marks=pytest.mark.slow),
+        pytest.param(nsjax.Taylor(), marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives_by_an_amplitude_of_zero(solver):
     """Pitfall 50: a rigid model has no time scale of its own: its steps have that of what drives the derivative."""
     want = np.broadcast_to([np.sin(10.0) / 2, np.sin(15.0) / 3], (4, 2))
     np.testing.assert_allclose(slopes(TwoWaves, solver, AMPLITUDES), want, atol=1e-6)
 
 
-@pytest.mark.parametrize("solver", [nsjax.Exponential(), nsjax.Affine()])
+@pytest.mark.parametrize("solver", [nsjax.Exponential(), pytest.param(nsjax.Affine(), marks=pytest.mark.slow)])
 def test_derivatives_by_an_amplitude_of_zero_in_exact_flows(solver):
     F, phase = np.asarray(AMPLITUDES).T
     want = [(np.sin(10 + phase) - np.sin(phase)) / 2, F * (np.cos(10 + phase) - np.cos(phase)) / 2]

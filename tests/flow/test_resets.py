@@ -81,7 +81,7 @@ def accumulation(v, a, b, r):
     return 2 * v * (1 / a + r / b) / (1 - r**2)
 
 
-@pytest.mark.parametrize("solver", [None, nsjax.Taylor()])
+@pytest.mark.parametrize("solver", [None, pytest.param(nsjax.Taylor(), marks=pytest.mark.slow)])
 def test_a_reset_on_a_surface_crossed_from_either_side(solver):
     """Pitfall 53: half a turn takes π whatever the amplitude: after the crossings at π/2 and 3π/2 the solution is r² cos t."""
 
@@ -309,7 +309,7 @@ def amount(k, T, dose, y, t):
     return y * jnp.exp(-k * t) + sum(dose * jnp.exp(-k * (t - n * T)) for n in range(1, 6))
 
 
-@pytest.mark.parametrize("solver", [None, nsjax.Taylor()])
+@pytest.mark.parametrize("solver", [None, pytest.param(nsjax.Taylor(), marks=pytest.mark.slow)])
 def test_doses_by_a_clock(solver):
     def end(p, y):
         return solve(Doses(*p), 0.0, 4.0, y, solver=solver, rtol=1e-10, atol=1e-10).y1
