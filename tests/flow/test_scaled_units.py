@@ -3,6 +3,7 @@
 import functools as ft
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -29,7 +30,7 @@ def program(key):
     start in those of the model."""
     entry = gallery.entry(key)
 
-    @jax.jit
+    @eqx.filter_jit  # numbers of a model are not traced: one may be that of its masses
     def run(system):
         controller = diffrax.PIDController(1e-8, 1e-8 * ft.reduce(jnp.minimum, jax.tree.leaves(system.state)))
 
