@@ -65,6 +65,21 @@ def test_without_a_period(case):
     check("3.4", case, "nothing")
 
 
+@ft.cache
+def reduced(case=None):
+    """The reduced map of x, and the velocity that repeats itself, in the units of the model."""
+    entry = gallery.entry("1.1(1)")
+    system = rescaled(entry.system(), jax.tree.map(jnp.asarray, entry.orbit.y0), case)
+    start, least = system.outside(entry.orbit.y0), min(1.0, *map(float, jax.tree.leaves(system.state)))
+    image = nsjax.reduced_map(system, 1.02 * start.x, "x", guess=start, rtol=1e-12, atol=1e-12 * least)
+    return float(image.value / system.state.x), float(image.y.v / system.state.v)
+
+
+@pytest.mark.parametrize("case", UNITS)
+def test_reduced_map(case):
+    np.testing.assert_allclose(reduced(case), reduced(), rtol=1e-10)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", UNITS)
 def test_within_a_program(case):
