@@ -42,8 +42,8 @@ class Orbit(eqx.Module, Generic[StateT]):
         the orbit leaves a surface that repels.
     - `structural_zeros`: how many of them vanish whatever the parameters, because the orbit slides or rests.
     - `stable`: whether all multipliers lie inside the unit circle, the trivial one of an autonomous system left out.
-    - `residual`: the largest component of y(t0 + period) - y0; of an orbit in segments that of their equations, relative
-        to the sizes of states, times and surfaces.
+    - `residual`: the largest component of y(t0 + period) - y0; of an orbit in segments that of their equations,
+        relative to the sizes of states, times and surfaces.
     - `admissible`: whether the orbit keeps to its modes: stays on its sides of the surfaces, with |λ| within its bound
         while it slides and a pushing force while it rests. One found by shooting does.
     - `violation`, `violation_t`: how far it does not, in the unit of h, λ or of the force, and when.
