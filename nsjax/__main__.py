@@ -18,6 +18,7 @@ from ._cli import (
     BOUNDS,
     branch_record,
     collect_rarely,
+    compile_loops_whole,
     controller,
     Diagram,
     diagram_for,
@@ -228,6 +229,7 @@ def main(argv: list[str] | None = None) -> int:
             STAGES.start("starting")
         args = parse(words)
         if argv is None:  # the process is ours
+            compile_loops_whole()
             keep_compiled(not getattr(args, "no_cache", False))
             collect_rarely()
         return _run_command(args)

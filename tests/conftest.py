@@ -5,6 +5,7 @@ import gc
 import os
 import pathlib
 import sys
+import zlib
 
 import jax
 import jaxlib
@@ -16,10 +17,12 @@ import pytest
 # leaving out LLVM's optimisation takes another fifth off the time of all tests. To split a program's code among threads
 # costs a tenth of its compile time, and the other processors have tests of their own. (Results must not depend on
 # rounding: `XLA_FLAGS=--xla_backend_optimization_level=3`, with fused multiplication and addition, is a second setting.)
-if jaxlib.__version__.startswith("0.10."):  # an unknown flag ends the process
-    quick = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
-    whole = "--xla_cpu_parallel_codegen_split_count=1"
-    os.environ["XLA_FLAGS"] = f"{quick} {whole} {os.environ.get('XLA_FLAGS', '')}"
+flags = []
+if jaxlib.__version__.startswith(("0.10.", "0.12.")):  # an unknown flag ends the process
+    flags += ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
+if jaxlib.__version__.startswith("0.10."):
+    flags.append("--xla_cpu_use_fusion_emitters=false")
+os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")])
 # JAX writes the entries of its cache in place, and a second process that reads one meanwhile reports that it is cut off.
 # Each worker of pytest therefore has a folder of its own (pitfall 59).
 programs = os.environ.get("JAX_COMPILATION_CACHE_DIR") or pathlib.Path(__file__).parents[1] / ".jax_cache"
@@ -52,6 +55,26 @@ def size():
     if sys.platform != "linux":
         return 0
     return int(pathlib.Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--part", metavar="K/N", help="run the K-th of N parts of the selected tests; -m slow --part 3/8")
+
+
+def pytest_collection_modifyitems(config, items):
+    """Keeps one part of the tests. A test is always in the same part, whatever else there is."""
+    part = config.getoption("part")
+    if part is None:
+        return
+    try:
+        k, n = map(int, part.split("/"))
+    except ValueError:
+        k, n = 0, 0
+    if not 1 <= k <= n:
+        raise pytest.UsageError(f"Option --part must be K/N with 1 <= K <= N, such as 3/8, but is {part!r}.")
+    parts = {item: zlib.crc32(item.nodeid.encode()) % n + 1 for item in items}
+    config.hook.pytest_deselected(items=[item for item in items if parts[item] != k])
+    items[:] = [item for item in items if parts[item] == k]
 
 
 class Compilations:

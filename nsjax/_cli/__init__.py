@@ -3,7 +3,11 @@
 from ._arguments import parse as parse, USAGE as USAGE
 from ._branch_record import branch_record as branch_record
 from ._branches import draw_branches as draw_branches
-from ._cache import collect_rarely as collect_rarely, keep_compiled as keep_compiled
+from ._cache import (
+    collect_rarely as collect_rarely,
+    compile_loops_whole as compile_loops_whole,
+    keep_compiled as keep_compiled,
+)
 from ._diagrams import Diagram as Diagram, diagram_for as diagram_for, DIAGRAMS as DIAGRAMS
 from ._family import Arc as Arc, Followed as Followed
 from ._follow import follow as follow, value_of as value_of

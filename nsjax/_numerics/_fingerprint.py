@@ -1,7 +1,7 @@
 """What a program is made of, as a number that is the same in another process.
 
 A program depends on the shapes of its arrays, on everything in its arguments that is no array, and on code: that of
-libraries, known by their versions, and that of the user, known by its instructions and by whatever these refer to.
+libraries, known by their files, and that of the user, known by its instructions and by whatever these refer to.
 """
 
 import dis
@@ -78,6 +78,16 @@ def is_library(thing: Any) -> bool:
     """Whether a class or function belongs to what is installed; its name then says what it is."""
     file = _source(thing)
     return file is not None and _within_library(file)
+
+
+@ft.cache
+def stamp(name: str) -> str:
+    """The files of a library: their names, sizes and times, so that one that was edited is another one."""
+    file, found = getattr(sys.modules.get(name), "__file__", None), hashlib.sha256()
+    for path in sorted(pathlib.Path(file).parent.rglob("*.py")) if file else ():
+        stat = path.stat()
+        found.update(f"{path} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+    return found.hexdigest()
 
 
 class Fingerprint:

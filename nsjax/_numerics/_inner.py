@@ -10,11 +10,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 from jax.interpreters import ad
 
-
-try:
-    from jax._src.interpreters.partial_eval import lower_jaxpr2
-except ImportError:  # then there are no primitives to replace
-    lower_jaxpr2: Any = None
+from ._undocumented import lower_jaxpr2
 
 
 Flat = Callable[..., list[Any]]  # of arrays, to arrays

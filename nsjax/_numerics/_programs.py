@@ -1,4 +1,4 @@
-"""Finished programs, kept in a folder from one process to the next: neither traced nor compiled again."""
+"""Traced programs that are kept in a folder, so that another process need not trace them again."""
 
 import contextlib
 import functools as ft
@@ -10,31 +10,42 @@ import pickle
 import platform
 import sys
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.export as jexp
 import jax.numpy as jnp
 import numpy as np
 
-from ._fingerprint import Fingerprint, KNOWN, UnknownError
+from ._fingerprint import Fingerprint, KNOWN, stamp, UnknownError
+from ._settings import settings
 
-
-try:
-    from jax._src.config import trace_context
-    from jax._src.util import cache
-    from jax.experimental import serialize_executable
-    from jaxlib.lapack import prepare_lapack_call
-except ImportError:  # then none is kept
-    trace_context: Any = None
 
 ROOM = 1 << 30  # bytes that the folder may take
-FORMAT = 3  # of the files
+FORMAT = 4  # of the files
+# What results may be made of beside arrays: classes of these packages, and plain values.
+PACKAGES = ("nsjax", "equinox", "diffrax", "optimistix", "lineax")
+PLAIN = (
+    "bool",
+    "bytes",
+    "complex",
+    "dict",
+    "float",
+    "frozenset",
+    "int",
+    "list",
+    "range",
+    "set",
+    "slice",
+    "str",
+    "tuple",
+)
 
 
 class _Place:
-    """Where programs are kept; `None`: nowhere."""
+    """The folder of programs; `None`: none are kept."""
 
     folder: pathlib.Path | None = None
 
@@ -52,20 +63,21 @@ def cache_folder() -> pathlib.Path:
 
 
 def keep_programs(folder: str | os.PathLike | None = None) -> pathlib.Path:
-    """From now on keeps finished programs in a folder, and looks there before it makes one: in another session, or when
-    a notebook is run again, the first answer comes without tracing and compiling. The command line does this by itself.
+    """From now on keeps traced programs in a folder, and looks there before it traces one: in another session, or when
+    a notebook is run again, the first answer comes sooner. The command line does this by itself.
 
-    What is kept are the programs of functions that are called directly, such as `solve`, `find_orbit` and `sweep`, on
-    one CPU; within your own `jax.jit` they are part of a program that JAX keeps (`jax_compilation_cache_dir`). One is
-    found again only if all that it was made of is the same: the code of the model with whatever it refers to, the kinds
-    of the arguments, nsjax, the libraries, the settings of JAX, the machine. If that cannot be told (of a model that
-    uses a module of yours, for instance), nothing is kept, and all works as before. What a model reads while it is
-    traced, files or the clock, is not looked at: read it before, into fields or constants.
+    Compiled code is kept by JAX, if you ask for it by `jax.config.update("jax_compilation_cache_dir", folder)`; the
+    two together skip nearly all that precedes the first answer. Programs are kept of functions that are called
+    directly, such as `solve`, `find_orbit` and `sweep`, on one CPU. One is found again only if all that it was made of
+    is the same: the code of the model with whatever it refers to, the kinds of the arguments, nsjax, the libraries, the
+    settings of JAX. If that cannot be told (of a model that uses a module of yours, for instance), nothing is kept, and
+    all works as before. What a model reads while it is traced, files or the clock, is not looked at: read it before,
+    into fields or constants.
 
     **Arguments:**
 
-    - `folder`: by default that of nsjax in the cache of the user. It holds executable code: use none that others can
-        write to. The programs not used for longest are dropped from 1 GiB on.
+    - `folder`: by default that of nsjax in the cache of the user. The programs not used for longest are dropped from
+        1 GiB on.
 
     **Returns:** the folder.
 
@@ -79,147 +91,96 @@ def keep_programs(folder: str | os.PathLike | None = None) -> pathlib.Path:
 
 def is_kept() -> bool:
     """Whether a program that is called now would be kept: on one device that is the processor."""
-    if _Place.folder is None or trace_context is None or jax.config.values["jax_disable_jit"]:
+    if _Place.folder is None or getattr(jax.config, "jax_disable_jit", False):
         return False
     return jax.default_backend() == "cpu" and jax.local_device_count() == 1
 
 
 class _Array:
-    """Stands in a tree for an array."""
+    """Stands for an array in a tree."""
 
 
 _ARRAY = _Array()
 
 
-def split(tree: Any) -> tuple[list[Any], tuple[Any, ...], Any]:
-    """The arrays of a tree, its other leaves with placeholders for these, and its structure."""
-    leaves, structure = jax.tree.flatten(tree)
-    arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
-    return arrays, tuple(_ARRAY if eqx.is_array(leaf) else leaf for leaf in leaves), structure
+def kept(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns `fn`, a function of pytrees, for a caller that traces it: its program comes from the folder, if it is
+    there, and is written to it, if it can be."""
+
+    @ft.wraps(fn)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        found = _found(fn, (args, kwargs)) if is_kept() else None
+        if found is None:
+            return fn(*args, **kwargs)
+        program, skeleton = found
+        results = iter(program.call([x for x in jax.tree.leaves((args, kwargs)) if eqx.is_array(x)]))
+        return jax.tree.map(lambda leaf: next(results) if leaf is _ARRAY else leaf, skeleton)
+
+    return call
 
 
-def _joined(arrays: Any, others: tuple[Any, ...], structure: Any) -> Any:
-    given = iter(arrays)
-    return jax.tree.unflatten(structure, [next(given) if leaf is _ARRAY else leaf for leaf in others])
+def uncommitted(tree: Any) -> Any:
+    """The same arguments, none of which is committed to a device, as the results of a program from the folder are:
+    `jax.jit` would compile once more for each combination of arguments that are and that are not."""
+
+    def leaf(x: Any) -> Any:
+        plain = isinstance(x, jax.Array) and not jnp.issubdtype(x.dtype, jax.dtypes.extended)  # no random key
+        return np.asarray(x) if plain and x.committed else x
+
+    return jax.tree.map(leaf, tree)
 
 
-class _Program:
-    """Compiled code, and of what it returns all that is no array. `again` compiles it, if it was read from a file."""
-
-    def __init__(self, compiled: Any, others: tuple[Any, ...], structure: Any, again: Any = None) -> None:
-        self.compiled, self.others, self.structure, self._again = compiled, others, structure, again
-
-    def __call__(self, arrays: list[Any]) -> Any:
-        try:
-            found = self.compiled(arrays)[:-1]
-        except jax.errors.JaxRuntimeError:
-            if self._again is None:
-                raise
-            self.compiled = self._again().compiled  # this machine cannot use the file
-            found = self.compiled(arrays)[:-1]
-        self._again = None  # it works
-        return _joined(found, self.others, self.structure)
-
-
-class Programs:
-    """A function as programs, one for each kind of arguments.
-
-    **Arguments:**
-
-    - `fn`: the function, of pytrees.
-    - `options`: gives the options of the compiler.
-    """
-
-    def __init__(self, fn: Callable[..., Any], options: Callable[[], dict[str, Any]]) -> None:
-        self._fn, self._options = fn, options
-        # With those of JAX: `jax.clear_caches()` forgets them too.
-        self._known = dict if trace_context is None else cache(max_size=None, trace_context_in_key=False)(dict)
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        arrays, *rest = split((args, kwargs))
-        return self._ready((args, kwargs), arrays, *rest)(arrays)
-
-    def ready(self, *args: Any) -> _Program:
-        """The program for such arguments, which is called with their arrays."""
-        return self._ready((args, {}), *split((args, {})))
-
-    def _ready(self, given: Any, arrays: list[Any], others: tuple[Any, ...], structure: Any) -> _Program:
-        kinds = tuple(jax.typeof(array) for array in arrays)
-        signature = (structure, others, tuple(map(type, others)), kinds, trace_context())
-        known = self._known()
-        program = known.get(signature)
-        if program is None:
-            program = known[signature] = self._made(given, arrays, others, structure)
-        return program
-
-    def _made(self, given: Any, arrays: list[Any], others: tuple[Any, ...], structure: Any) -> _Program:
-        """Read from the folder, if there is one; or compiled, and written there."""
-        again = ft.partial(self._compiled, arrays, others, structure)
-        if not is_kept():
-            return again()
-        assert _Place.folder is not None
-        fingerprint = Fingerprint()
-        try:
-            fingerprint.constant((_surroundings(), _settings(), self._options()))
-            fingerprint.constant(self._fn)
-            fingerprint.traced(given)
-        except (UnknownError, RecursionError):
-            return again()
-        file = _Place.folder / f"{fingerprint.digest}.program"
-        program = _read(file, arrays, fingerprint, again)
-        if program is None:
-            program = again()
-            _write(file, program, fingerprint)
-        return program
-
-    def _compiled(self, arrays: list[Any], others: tuple[Any, ...], structure: Any) -> _Program:
-        returned: list[Any] = []
-
-        def kept_by_nsjax(arrays: list[Any]) -> list[Any]:
-            args, kwargs = _joined(arrays, others, structure)
-            found, *rest = split(self._fn(*args, **kwargs))
-            returned[:] = rest
-            # With this besides, as `equinox.filter_jit` has it by chance, XLA's executor hands fewer tasks to other
-            # threads: sweeps take half of the processor's time, and two thirds of the clock's.
-            return [*found, jnp.zeros((), jnp.int32)]
-
-        lowered = jax.jit(kept_by_nsjax).lower(arrays)
-        with _not_kept_by_jax() if is_kept() else contextlib.nullcontext():
-            compiled = lowered.compile(self._options() or None)
-        return _Program(compiled, *returned)
-
-
-@contextlib.contextmanager
-def _not_kept_by_jax() -> Iterator[None]:
-    """Code that comes out of JAX's own cache cannot be written again (its functions are not found when it is run)."""
-    name = "jax_persistent_cache_min_compile_time_secs"
-    before = getattr(jax.config, name)
-    jax.config.update(name, float("inf"))
+def _found(fn: Callable[..., Any], given: Any) -> tuple[jexp.Exported, Any] | None:
+    """The program of `fn` for such arguments, and its result with placeholders for arrays; None if none is kept."""
+    assert _Place.folder is not None
+    fingerprint = Fingerprint()
     try:
-        yield
-    finally:
-        jax.config.update(name, before)
+        fingerprint.constant((_surroundings(), settings()))
+        fingerprint.constant(fn)
+        fingerprint.traced(given)
+    except (UnknownError, RecursionError):
+        return None
+    file = _Place.folder / f"{fingerprint.digest}.program"
+    found = _read(file, fingerprint)
+    if found is None:
+        found = _traced(fn, given)
+        if found is not None:
+            _write(file, *found, fingerprint)
+    return found
+
+
+def _traced(fn: Callable[..., Any], given: Any) -> tuple[jexp.Exported, Any] | None:
+    leaves, structure = jax.tree.flatten(given)
+    skeleton: list[Any] = []
+
+    def listed(arrays: list[Any]) -> list[Any]:
+        rest = iter(arrays)
+        args, kwargs = jax.tree.unflatten(structure, [next(rest) if eqx.is_array(x) else x for x in leaves])
+        out = fn(*args, **kwargs)
+        skeleton[:] = [jax.tree.map(lambda x: _ARRAY if eqx.is_array(x) else x, out)]
+        return [x for x in jax.tree.leaves(out) if eqx.is_array(x)]
+
+    def form(x: Any) -> jax.ShapeDtypeStruct:
+        aval = jax.typeof(x)
+        return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type)
+
+    forms = [form(x) for x in leaves if eqx.is_array(x)]
+    try:
+        return jexp.export(jax.jit(listed))(forms), skeleton[0]
+    except (ValueError, NotImplementedError):  # it calls Python, or something else that is not portable
+        return None
 
 
 @ft.cache
 def _surroundings() -> tuple[Any, ...]:
-    """What a program depends on beside its arguments, and what does not change while a process runs: this package, the
-    libraries, Python and the machine."""
+    """What a program depends on beside its arguments, and what does not change while a process runs: the files of this
+    package and of the libraries, Python and the machine."""
     ours = hashlib.sha256()
     for path in sorted(pathlib.Path(__file__).parents[1].rglob("*.py")):
         ours.update(str(path).encode() + path.read_bytes())
-    versions = [getattr(sys.modules.get(name), "__version__", "") for name in KNOWN]
-    with contextlib.suppress(OSError):
-        lines = pathlib.Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
-        versions += [line for line in lines if line.startswith(("model name", "flags", "Features"))]
-    given = sorted((k, v) for k, v in os.environ.items() if k.startswith(("XLA_", "EQX_")))
-    return (FORMAT, ours.hexdigest(), versions, sys.version, platform.platform(), platform.processor(), given)
-
-
-def _settings() -> list[Any]:
-    """Those of JAX that are not about caches or what it writes of its own work."""
-    names = (name for name in sorted(jax.config.values) if not any(word in name for word in ("cache", "log", "dump")))
-    return [(name, str(getattr(jax.config, name, None))) for name in names]
+    libraries = [stamp(name) for name in KNOWN if name != "nsjax"]
+    given = sorted((k, v) for k, v in os.environ.items() if k.startswith("EQX_"))
+    return (FORMAT, ours.hexdigest(), libraries, sys.version, platform.platform(), given)
 
 
 class _Writer(pickle.Pickler):
@@ -242,15 +203,24 @@ class _Reader(pickle.Unpickler):
     def persistent_load(self, pid: Any) -> Any:
         return _ARRAY if pid == "array" else self._seen[pid]
 
+    def find_class(self, module_name: str, global_name: str) -> Any:
+        """Classes of results alone, so that a file of someone else's can run nothing."""
+        plain = module_name == "builtins" and global_name in PLAIN
+        if plain or module_name.partition(".")[0] in PACKAGES:
+            found = super().find_class(module_name, global_name)
+            if isinstance(found, type):
+                return found
+        raise pickle.UnpicklingError(f"{module_name}.{global_name} is no class of a result")
 
-def _write(file: pathlib.Path, program: _Program, fingerprint: Fingerprint) -> None:
-    """Some cannot be written: those that call Python, for instance."""
+
+def _write(file: pathlib.Path, program: jexp.Exported, skeleton: Any, fingerprint: Fingerprint) -> None:
+    """Some results cannot be written: those that hold functions of this process, for instance."""
+    form = io.BytesIO()
     try:
-        code = serialize_executable.serialize(program.compiled)[0]
-        skeleton, count = io.BytesIO(), 1 + sum(leaf is _ARRAY for leaf in program.others)
-        _Writer(skeleton, fingerprint).dump(jax.tree.unflatten(program.structure, program.others))
-        whole = zlib.compress(pickle.dumps((skeleton.getvalue(), count, code)), 1)
-    except Exception:  # of every kind, by what is within
+        _Writer(form, fingerprint).dump(skeleton)
+        parts = form.getvalue(), bytes(program.serialize())
+        whole = zlib.compress(b"".join(len(part).to_bytes(8, "big") + part for part in parts), 1)
+    except Exception:  # of every kind, by what is within; ImportError without flatbuffers
         return
     with contextlib.suppress(OSError):
         _make_room(file.parent, len(whole))
@@ -259,27 +229,17 @@ def _write(file: pathlib.Path, program: _Program, fingerprint: Fingerprint) -> N
         part.replace(file)
 
 
-def _read(
-    file: pathlib.Path, arrays: list[Any], fingerprint: Fingerprint, again: Callable[[], _Program]
-) -> _Program | None:
+def _read(file: pathlib.Path, fingerprint: Fingerprint) -> tuple[jexp.Exported, Any] | None:
     """Nothing if there is none, or if it cannot be used."""
     try:
-        skeleton, count, code = pickle.loads(zlib.decompress(file.read_bytes()))
-        tree = _Reader(io.BytesIO(skeleton), fingerprint).load()
-        _, others, structure = split(tree)
-        wanted = jax.tree.structure(((arrays,), {})), jax.tree.structure([0] * count)
-        _give_lapack()
-        compiled = serialize_executable.deserialize_and_load(code, *wanted)
+        whole = zlib.decompress(file.read_bytes())
+        size = int.from_bytes(whole[:8], "big")
+        skeleton = _Reader(io.BytesIO(whole[8 : 8 + size]), fingerprint).load()
+        program = jexp.deserialize(bytearray(whole[16 + size :]))
         os.utime(file)
     except Exception:  # of every kind, by what is wrong with it
         return None
-    return _Program(compiled, others, structure, again)
-
-
-@ft.cache
-def _give_lapack() -> None:
-    """Tracing looks up the functions of LAPACK; without it finished code would call nothing, which ends the process."""
-    prepare_lapack_call("getrf", np.dtype("float64"))
+    return program, skeleton
 
 
 def _make_room(folder: pathlib.Path, size: int) -> None:

@@ -5,20 +5,21 @@ again. So what is the same at every point is given once, and the results come as
 """
 
 import functools as ft
-import weakref
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._compile import interactive, on_host, options, without_collection
+from ._compile import on_host, options, without_collection
 from ._products import full_products
-from ._programs import Programs, split, trace_context
-from ._whole_loops import whole_loops
+from ._programs import kept, uncommitted
 
 
+@jax.tree_util.register_static
 class Same:
     """A thing as a key: itself, and nothing that is equal to it."""
 
@@ -32,6 +33,28 @@ class Same:
         return isinstance(other, Same) and other.it is self.it
 
 
+class _Static:
+    """All of a tree but its arrays, as a key."""
+
+    def __init__(self, tree: Any) -> None:
+        leaves, self._structure = jax.tree.flatten(tree)
+        self.arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        self._others = tuple(None if eqx.is_array(leaf) else (type(leaf), leaf) for leaf in leaves)
+        self._hash = hash((self._structure, self._others))  # once: it takes as long as a step
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, _Static):
+            return False
+        return other is self or (other._structure, other._others) == (self._structure, self._others)
+
+    def with_arrays(self, arrays: list[Any]) -> Any:
+        rest = iter(arrays)
+        return jax.tree.unflatten(self._structure, [next(rest) if x is None else x[1] for x in self._others])
+
+
 class Repeated:
     """A function of pytrees that Python calls often, and not within other programs; it returns NumPy's arrays.
 
@@ -42,55 +65,55 @@ class Repeated:
 
     def __init__(self, fn: Callable[..., Any]) -> None:
         joined = ft.partial(_joined, fn)
-        self.programs = [Programs(joined, ft.partial(options, often=True, loops=loops)) for loops in (False, True)]
-        self.plain = interactive(fn, host=True)
 
-    def at(self, *given: Any, loops: bool = False) -> Callable[..., Any]:
-        """With its first arguments given: a function of the others, which are arrays, or tuples of them.
+        def run(static: _Static, arrays: list[Any], args: tuple[Any, ...]) -> tuple[list[Any], Same]:
+            vectors, forms = kept(joined)(*static.with_arrays(arrays), *args)
+            return vectors, Same(forms)
 
-        With its `loops` as one function each a program takes a fifth longer to compile: that pays where they have many
-        turns.
-        """
-        return _At(self, given, loops)
+        @ft.cache  # not on import: which options there are is found out by compiling
+        def program() -> Any:
+            return jax.jit(run, static_argnums=0, compiler_options=options(often=True))
+
+        self._program = program
+
+    def at(self, *given: Any) -> Callable[..., Any]:
+        """With its first arguments given: a function of the others, which are arrays, or tuples of them."""
+        static = _Static(given)
+        arrays = jax.device_put(uncommitted(static.arrays))
+
+        @full_products
+        def call(*args: Any) -> Any:
+            with without_collection():
+                vectors, forms = self._program()(static, arrays, uncommitted(args))
+            return _apart(vectors, forms.it)
+
+        return call
 
 
-class _At:
-    def __init__(self, repeated: Repeated, given: Any, loops: bool) -> None:
-        self._repeated, self._given, self._loops = repeated, given, loops
-        self._arrays = jax.device_put(split(given)[0])
-        self._ready: dict[Any, Callable[[], Any]] = {}  # weak references: `jax.clear_caches()` lets programs go
+class _Form(NamedTuple):
+    """An array among those of its kind."""
 
-    @full_products
-    def __call__(self, *args: Any) -> Any:
-        programs, arrays = self._repeated.programs[self._loops], jax.tree.leaves(args)
-        if trace_context is None or jax.config.values["jax_disable_jit"]:
-            return self._repeated.plain(*self._given, *args)
-        kind = (trace_context(), *((x.shape, x.dtype) for x in arrays))
-        program = self._ready[kind]() if kind in self._ready else None
-        if program is None:
-            with without_collection(), whole_loops(self._loops):
-                program = programs.ready(*self._given, *args)
-            self._ready[kind] = weakref.ref(program)
-        return _apart(*program([*self._arrays, *arrays]))
+    dtype: str
+    shape: tuple[int, ...]
 
 
 def _joined(fn: Callable[..., Any], *args: Any) -> tuple[list[Any], Any]:
     """The arrays that a function returns as one of each kind, and their forms."""
-    tree = fn(*args)
-    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    tree = jax.tree.map(jnp.asarray, fn(*args))
+    leaves = jax.tree.leaves(tree)
     kinds = list(dict.fromkeys(leaf.dtype for leaf in leaves))
     vectors = [jnp.concatenate([jnp.ravel(x) for x in leaves if x.dtype == kind]) for kind in kinds]
-    return vectors, jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.asarray(x).dtype), tree)
+    return vectors, jax.tree.map(lambda x: _Form(x.dtype.name, x.shape), tree)
 
 
 def _apart(vectors: list[Any], forms: Any) -> Any:
     """Views of them."""
-    places = {vector.dtype: [vector, 0] for vector in on_host(vectors)}
+    places = {vector.dtype.name: [vector, 0] for vector in on_host(vectors)}
 
-    def view(form: Any) -> np.ndarray:
+    def view(form: _Form) -> np.ndarray:
         place = places[form.dtype]
         vector, start = place
-        place[1] = stop = start + form.size
+        place[1] = stop = start + math.prod(form.shape)
         return vector[start:stop].reshape(form.shape)
 
-    return jax.tree.map(view, forms)
+    return jax.tree.map(view, forms, is_leaf=lambda x: isinstance(x, _Form))

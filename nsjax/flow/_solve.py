@@ -20,7 +20,6 @@ from .._numerics._merge import merged
 from .._numerics._select import select
 from .._numerics._text import known, suggesting
 from .._numerics._while_any import while_any
-from .._numerics._whole_loops import ask_for_whole_loops
 from .._types import Scalar, StateT, Y
 from ..system._checks import check_model, closing_contacts, forces_on_speeds
 from ..system._mode import ModeState
@@ -395,8 +394,6 @@ def solve(
     sol, left = _run(system, t0, t1, y0, options)
     if left is not None:
         return left_over(left, sol)
-    if len(system.switches) <= 1 and not isinstance(integrator.solver, Taylor | AbstractExponential):
-        ask_for_whole_loops()  # (of more switches that takes 1.4 times as long to compile)
     if not concrete:
         return sol
     if not known(sol.result):  # numbers that are known, within a function that is being compiled

@@ -11,9 +11,6 @@ import numpy as np
 # Small enough for the working set of a step to stay in the cache and for lanes to wait for few others, large enough to
 # fill the vector units and hide what every step costs once: `benchmarks/growth.py` measures it.
 CHUNK = 256
-# From so many lanes on a program may take longer to compile that runs in two thirds of the time (with impacts a
-# quarter longer, with friction alone about as long).
-WORTH = 4096
 
 
 class Lanes(NamedTuple):
@@ -59,11 +56,6 @@ def lanes_of(args: Any) -> Lanes:
 
 def default_chunk(lanes: int, platform: str) -> int:
     return CHUNK if platform == "cpu" else max(1, lanes)
-
-
-def are_many(lanes: int) -> bool:
-    """Whether their program may take longer to compile if it runs faster."""
-    return lanes >= WORTH
 
 
 def even_chunks(lanes: int, chunk: int) -> tuple[int, int]:

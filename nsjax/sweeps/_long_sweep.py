@@ -18,7 +18,7 @@ from ._dataset import dataframe, dataset, leaf_names
 from ._devices import DeviceQueue, Devices, devices_of
 from ._fingerprint import differences, fingerprint
 from ._folder import Folder
-from ._lanes import are_many, CHUNK, default_chunk, lanes_of
+from ._lanes import CHUNK, default_chunk, lanes_of
 from ._outcomes import Outcome, outcome_of
 from ._piece import MOST, Piece
 from ._progress import Meter, Status
@@ -117,8 +117,7 @@ class Sweep:
         self._block, self._number = block, -(-lanes.number // block)
         chunk = max(1, min(chunk, lanes.number))  # of few lanes there are no more in a chunk
         chunks = -(-min(block, max(1, lanes.number)) // chunk)
-        many = are_many(min(block, lanes.number))
-        self._piece = Piece(fn, lanes, chunk, min(MOST, chunks), self._devices, many=many)
+        self._piece = Piece(fn, lanes, chunk, min(MOST, chunks), self._devices)
         self._lanes = lanes.on_host()
         self._owner = myself()
         self._folder = Folder(path, self._owner.token)
@@ -278,7 +277,7 @@ def sweep_again(
     lanes = lanes_of(args)
     number = lanes.number
     if path is None:
-        return on_host(in_pieces(fn, lanes, chunk, 1, devices_of(devices), tell, many=False))
+        return on_host(in_pieces(fn, lanes, chunk, 1, devices_of(devices), tell))
     short = chunk - lanes.number
     if short > 0:
         lanes = jax.tree.map(lambda x: np.concatenate([x, *[x[-1:]] * short]), lanes.mapped), lanes.rest

@@ -15,15 +15,10 @@ import numpy as np
 
 from .._numerics._compile import swept, without_collection
 from .._numerics._first_pass import first_pass, told, UnreachableError
-from .._numerics._whole_loops import on_request, Request
+from .._numerics._settings import settings
 from ._devices import Device
 from ._lanes import Lanes
 
-
-try:
-    from jax._src.config import trace_context
-except ImportError:  # then of all settings that a program depends on only the one that matters most is looked at
-    trace_context = None
 
 KEPT = 16  # programs
 MOST = 16  # chunks: so many that handing a piece out costs little, so few that no device waits long for another
@@ -32,9 +27,9 @@ MOST = 16  # chunks: so many that handing a piece out costs little, so few that 
 class Piece:
     """Up to `chunks` chunks of `chunk` lanes, as many as there are.
 
-    The program does not know how many lanes there are in all (but that there are `many`), nor who computes the others.
-    So a lane has the same bits whichever device, thread or process it falls to, and whatever was done before. What the
-    `first` pass leaves over is computed `again`, by another program.
+    The program does not know how many lanes there are in all, nor who computes the others. So a lane has the same bits
+    whichever device, thread or process it falls to, and whatever was done before. What the `first` pass leaves over is
+    computed `again`, by another program.
     """
 
     def __init__(
@@ -45,14 +40,13 @@ class Piece:
         chunks: int,
         devices: Sequence[Device],
         *,
-        many: bool,
         first: bool = True,
     ):
         self.chunk, self.size, self.platform = chunk, chunk * chunks, devices[0].platform
         # What is the same for all pieces is brought to each device once.
         self._shared, static = eqx.partition((fn, lanes.rest), eqx.is_array)
         self._there: dict[Device, Any] = {}
-        found = ft.partial(_program_for, static, self._shared, lanes.mapped, _How(chunk, chunks, tuple(devices), many))
+        found = ft.partial(_program_for, static, self._shared, lanes.mapped, _How(chunk, chunks, tuple(devices)))
         self.program = found(first)
         self.again = found(False) if self.program.tells else None
 
@@ -105,15 +99,14 @@ class Program:
     - `tells`: whether it returns beside that which lanes it has left over.
     """
 
-    def __init__(self, function: Callable[..., Any], forms: Any, devices: Sequence[Device], many: bool):
+    def __init__(self, function: Callable[..., Any], forms: Any, devices: Sequence[Device]):
         def placed(device: Device) -> Any:
             place = jax.sharding.SingleDeviceSharding(device)
             kind = jax.ShapeDtypeStruct
             return jax.tree.map(lambda x: kind(x.shape, x.dtype, sharding=place, weak_type=x.weak_type), forms)
 
         jitted = jax.jit(function)
-        self._on_request = ft.partial(on_request, Request()) if many else contextlib.nullcontext
-        with without_collection(), self._on_request():
+        with without_collection():
             # Lowered here and not in the threads, which do not see settings that are made by `with jax.enable_x64():`.
             traced = [jitted.trace(*placed(device)) for device in devices]
             lowered = [one.lower() for one in traced]
@@ -136,8 +129,7 @@ class Program:
         """Compiled for a device, on the first call."""
         with self._locks[device]:
             if device not in self._compiled:
-                with self._on_request():
-                    self._compiled[device] = self._lowered.pop(device).compile(swept())
+                self._compiled[device] = self._lowered.pop(device).compile(swept())
             return self._compiled[device]
 
 
@@ -145,7 +137,6 @@ class _How(NamedTuple):
     chunk: int
     chunks: int
     devices: tuple[Device, ...]
-    many: bool
 
 
 _kept: collections.OrderedDict[Any, Program] = collections.OrderedDict()
@@ -165,15 +156,14 @@ def _program_for(static: Any, shared: Any, mapped: Any, how: _How, first: bool) 
     def made() -> Program:
         if first:
             with contextlib.suppress(UnreachableError), first_pass():
-                return Program(_function(static, how, told), forms, how.devices, how.many)
-        return Program(_function(static, how, lambda fn: lambda *args: (fn(*args), None)), forms, how.devices, how.many)
+                return Program(_function(static, how, told), forms, how.devices)
+        return Program(_function(static, how, lambda fn: lambda *args: (fn(*args), None)), forms, how.devices)
 
     forms = jax.tree.map(form, shared), jax.tree.map(rows, mapped), form(np.int32(0))
     (own, own_tree), (flat, tree) = jax.tree.flatten(static), jax.tree.flatten(forms)
     types = tuple((x.shape, x.dtype, x.weak_type) for x in flat)
     # (Of a number with its type: True is 1, and another program.)
-    settings = trace_context() if trace_context is not None else jnp.result_type(float)
-    key = tuple((type(x), x) for x in own), own_tree, types, tree, how, first, settings
+    key = tuple((type(x), x) for x in own), own_tree, types, tree, how, first, settings()
     try:
         found = _kept.pop(key, None)
     except TypeError:  # the function holds what cannot be compared

@@ -13,10 +13,9 @@ from .._numerics._compile import eager, interactive, long_running, MANY
 from .._numerics._first_pass import first_pass, told, UnreachableError
 from .._numerics._progress import Counting, ProgressMeter, QUIET, Told
 from .._numerics._text import known, positive
-from .._numerics._whole_loops import on_request
 from ._chunks import in_chunks
 from ._devices import Device, DeviceQueue, Devices, devices_of
-from ._lanes import are_many, default_chunk, even_chunks, Lanes, lanes_of
+from ._lanes import default_chunk, even_chunks, Lanes, lanes_of
 from ._piece import MOST, Piece
 from ._sharded import sharded, spread_over
 
@@ -96,11 +95,10 @@ def sweep(
         return sharded(fn, lanes, chunk, *spread)
     if chunk is None:
         chunk = default_chunk(lanes.number, jax.default_backend())
-    with on_request() if are_many(lanes.number) else contextlib.nullcontext():
-        if lanes.number and eager() and known((fn, lanes)):
-            with contextlib.suppress(UnreachableError):
-                return _in_passes(fn, lanes, chunk)
-        return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, chunk)
+    if lanes.number and eager() and known((fn, lanes)):
+        with contextlib.suppress(UnreachableError):
+            return _in_passes(fn, lanes, chunk)
+    return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, chunk)
 
 
 def _in_passes(fn: Callable[..., Any], lanes: Lanes, chunk: int) -> Any:
@@ -131,7 +129,7 @@ def _in_passes(fn: Callable[..., Any], lanes: Lanes, chunk: int) -> Any:
 def _again(fn: Callable[..., Any], lanes: Lanes, chunk: int) -> Any:
     """By the whole program, whatever their number: compiled quickly, if they are few."""
     if lanes.number > MANY:
-        return in_pieces(fn, lanes, chunk, 1, devices_of(None), many=are_many(lanes.number), first=False)
+        return in_pieces(fn, lanes, chunk, 1, devices_of(None), first=False)
     filled = lanes.rows(np.minimum(np.arange(MANY), lanes.number - 1))
     return jax.tree.map(lambda x: x[: lanes.number], _few(fn, jax.tree.map(jnp.asarray, filled), lanes.rest, MANY))
 
@@ -160,7 +158,7 @@ def _handed_out(fn: Callable[..., Any], lanes: Lanes, chunk: int | None, devices
     chunks, chunk = even_chunks(lanes.number, chunk)
     if not lanes.number:
         return _run(fn, jax.tree.map(jnp.asarray, lanes.mapped), lanes.rest, 1)
-    return in_pieces(fn, lanes, chunk, min(MOST, -(-chunks // PIECES)), found, tell, many=are_many(lanes.number))
+    return in_pieces(fn, lanes, chunk, min(MOST, -(-chunks // PIECES)), found, tell)
 
 
 def in_pieces(
@@ -171,13 +169,12 @@ def in_pieces(
     found: list[Device],
     tell: Tell | None = None,
     *,
-    many: bool,
     first: bool = True,
 ) -> Any:
     """Pieces of so many chunks `together`, each on the device that is free first. `tell` is called with the number of
-    lanes that are done. Of `many` the program may take longer to compile. A `first` pass may do with a smaller one."""
+    lanes that are done. A `first` pass may do with a smaller program."""
     found = found[: -(-lanes.number // (chunk * together))]  # a device without a piece needs no program
-    piece, lanes = Piece(fn, lanes, chunk, together, found, many=many, first=first), lanes.on_host()
+    piece, lanes = Piece(fn, lanes, chunk, together, found, first=first), lanes.on_host()
     out = [np.empty((lanes.number, *form.shape), form.dtype) for form in piece.program.forms]
     starts = range(0, lanes.number, piece.size)
     with DeviceQueue(found) as each:

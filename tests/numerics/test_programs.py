@@ -1,8 +1,11 @@
-"""Finished programs in a folder: found again by another process, and only where nothing differs."""
+"""Traced programs in a folder: found again by another process, and only where nothing differs."""
 
 import os
+import pickle
 import subprocess
 import sys
+import types
+import zlib
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +15,8 @@ import pytest
 import nsjax
 from nsjax._numerics import _programs
 from nsjax._numerics._compile import interactive
-from nsjax._numerics._programs import cache_folder, keep_programs, Programs
+from nsjax._numerics._fingerprint import stamp
+from nsjax._numerics._programs import cache_folder, keep_programs
 
 
 @pytest.fixture
@@ -22,16 +26,16 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def compiled(monkeypatch):
-    """How often something was traced and compiled."""
-    seen, compile_ = [], Programs._compiled
+def traced(monkeypatch):
+    """The functions that were traced."""
+    names, trace = [], _programs._traced
 
-    def spied(self, *args):
-        seen.append(self._fn.__name__)
-        return compile_(self, *args)
+    def spied(fn, given):
+        names.append(fn.__name__)
+        return trace(fn, given)
 
-    monkeypatch.setattr(Programs, "_compiled", spied)
-    return seen
+    monkeypatch.setattr(_programs, "_traced", spied)
+    return names
 
 
 def made():
@@ -48,53 +52,87 @@ def made():
 A, B = np.asarray([[2.0, 1.0], [0.5, 3.0]]), np.asarray([1.0, 2.0])
 
 
-def test_a_program_is_found_again(folder, compiled):
+def test_a_program_is_found_again(folder, traced):
     """With everything that it returns beside arrays."""
     first = made()({"a": A, "b": B}, 2)
-    assert compiled == ["solved"] and len(list(folder.iterdir())) == 1
+    assert traced == ["solved"] and len(list(folder.iterdir())) == 1
     fn = made()
     for factor in (1, 2):
         again = fn({"a": jnp.asarray(A), "b": factor * B}, 2)
         np.testing.assert_array_equal(again.pop("x"), factor**2 * first["x"])
         assert again == {"label": "a", "power": 2, "none": None, "kind": str}
-    assert compiled == ["solved"]
+    assert traced == ["solved"]
     np.testing.assert_allclose(made()({"a": A, "b": B}, 3)["x"], np.linalg.solve(A, B**3), rtol=1e-15)
     made()({"a": A, "b": B}, 2, label="b"), made()({"a": A, "b": B}, 2.0)
-    assert compiled == ["solved"] * 4 and len(list(folder.iterdir())) == 4
-    fn({"a": A, "b": B}, True), fn({"a": A, "b": B}, 1)  # equal, and yet not the same
-    assert len(compiled) == 6
+    assert traced == ["solved"] * 4 and len(list(folder.iterdir())) == 4
     with jax.enable_x64(False):
         assert made()({"a": A, "b": B}, 2)["x"].dtype == jnp.float32
-    assert len(compiled) == 7
+    assert len(traced) == 5
+
+
+def test_results_are_arguments_of_the_same_program(folder, compilations):
+    """JAX commits the results of a program that was read to a device, and would compile it again for such arguments."""
+    made()({"a": A, "b": B}, 2)
+    fn = made()
+    x = fn({"a": A, "b": B}, 2)["x"]
+    count = len(compilations)
+    for _ in range(2):
+        x = fn({"a": A, "b": x}, 2)["x"]
+    assert len(compilations) == count
+
+
+@pytest.fixture
+def compilations():
+    names = []
+
+    def listen(event, seconds, **about):
+        if event == "/jax/core/compile/backend_compile_duration":
+            names.append(about.get("fun_name"))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(listen)
 
 
 @pytest.mark.parametrize(
     "damage", [lambda code: code[: len(code) // 2], lambda code: b"", lambda code: b"0" + code[1:]]
 )
-def test_a_damaged_file_is_made_anew(folder, compiled, damage):
+def test_a_damaged_file_is_made_anew(folder, traced, damage):
     first = made()({"a": A, "b": B}, 2)
     (file,) = folder.iterdir()
     file.write_bytes(damage(file.read_bytes()))
     np.testing.assert_array_equal(made()({"a": A, "b": B}, 2)["x"], first["x"])
-    assert len(compiled) == 2
+    assert len(traced) == 2
     made()({"a": A, "b": B}, 2)
-    assert len(compiled) == 2
+    assert len(traced) == 2
 
 
-def test_code_that_does_not_run_is_made_anew(folder, compiled, monkeypatch):
-    made()({"a": A, "b": B}, 2)
+class Command:
+    """What runs a command when it is unpickled."""
 
-    def refused(*args):
-        raise jax.errors.JaxRuntimeError("NOT_FOUND: Function not found")
+    def __init__(self, call):
+        self.call = call
 
-    monkeypatch.setattr(_programs.serialize_executable, "deserialize_and_load", lambda *args: refused)
-    fn = made()
-    np.testing.assert_allclose(fn({"a": A, "b": B}, 2)["x"], np.linalg.solve(A, B**2), rtol=1e-15)
-    fn({"a": A, "b": B}, 2)
-    assert len(compiled) == 2
+    def __reduce__(self):
+        return self.call
 
 
-def test_what_calls_python_is_not_written(folder, compiled):
+@pytest.mark.parametrize(
+    "call", [(exec, ("raise SystemExit",)), (nsjax.keep_programs, ("elsewhere",))], ids=["built in", "ours"]
+)
+def test_a_file_cannot_run_anything(folder, traced, monkeypatch, tmp_path, call):
+    monkeypatch.chdir(tmp_path)
+    first = made()({"a": A, "b": B}, 2)
+    (file,) = folder.iterdir()
+    whole = zlib.decompress(file.read_bytes())
+    program = whole[8 + int.from_bytes(whole[:8], "big") :]
+    skeleton = pickle.dumps(Command(call))
+    file.write_bytes(zlib.compress(len(skeleton).to_bytes(8, "big") + skeleton + program))
+    np.testing.assert_array_equal(made()({"a": A, "b": B}, 2)["x"], first["x"])
+    assert len(traced) == 2 and not (tmp_path / "elsewhere").exists()
+
+
+def test_what_calls_python_is_not_written(folder):
     for _ in range(2):
 
         @interactive
@@ -102,10 +140,10 @@ def test_what_calls_python_is_not_written(folder, compiled):
             return jax.pure_callback(lambda x: 2 * x, jax.ShapeDtypeStruct((), x.dtype), x)
 
         assert asked(jnp.asarray(2.0)) == 4
-    assert compiled == ["asked"] * 2 and not list(folder.iterdir())
+    assert not list(folder.iterdir())
 
 
-def test_room(folder, compiled, monkeypatch):
+def test_room(folder, traced, monkeypatch):
     """Those that were not used for longest make place."""
     for power in (1, 2, 3):
         made()({"a": A, "b": B}, power)
@@ -115,14 +153,14 @@ def test_room(folder, compiled, monkeypatch):
     monkeypatch.setattr(_programs, "ROOM", int(1.1 * size))  # they differ by a few bytes
     made()({"a": A, "b": B}, 4)
     assert len(list(folder.iterdir())) == 3
-    del compiled[:]
+    del traced[:]
     made()({"a": A, "b": B}, 1), made()({"a": A, "b": B}, 3)
-    assert compiled == []
+    assert traced == []
     made()({"a": A, "b": B}, 2)
-    assert compiled == ["solved"]
+    assert traced == ["solved"]
 
 
-def test_only_where_it_was_asked_for(tmp_path, monkeypatch, compiled):
+def test_only_where_it_was_asked_for(tmp_path, monkeypatch, traced):
     """And transformed, or within another program, a function is what it always was."""
     monkeypatch.setattr(_programs._Place, "folder", None)
     made()({"a": A, "b": B}, 2)
@@ -131,17 +169,30 @@ def test_only_where_it_was_asked_for(tmp_path, monkeypatch, compiled):
     jax.jit(lambda b: fn({"a": A, "b": b}, 2)["x"])(B)
     jax.jvp(lambda b: fn({"a": A, "b": b}, 2)["x"], (B,), (B,))
     jax.vmap(lambda b: fn({"a": A, "b": b}, 2)["x"])(np.stack([B, B]))
-    assert compiled == [] and not list(tmp_path.iterdir())
+    assert traced == [] and not list(tmp_path.iterdir())
 
 
-def test_memory_is_freed_with_that_of_jax(folder, compiled):
+def test_memory_is_freed_with_that_of_jax(folder, traced):
     fn = made()
     fn({"a": A, "b": B}, 2), fn({"a": A, "b": B}, 2)
     for file in folder.iterdir():
         file.unlink()
     jax.clear_caches()
     fn({"a": A, "b": B}, 2)
-    assert len(compiled) == 2
+    assert len(traced) == 2
+
+
+def test_an_edited_library_is_another_one(tmp_path, monkeypatch):
+    file = tmp_path / "library" / "__init__.py"
+    file.parent.mkdir()
+    file.write_text("x = 1")
+    monkeypatch.setitem(sys.modules, "library", types.SimpleNamespace(__file__=str(file)))
+    first = stamp.__wrapped__("library")
+    assert stamp.__wrapped__("library") == first
+    file.write_text("x = 12")
+    second = stamp.__wrapped__("library")
+    (file.parent / "more.py").write_text("")
+    assert len({first, second, stamp.__wrapped__("library")}) == 3
 
 
 MODEL = """

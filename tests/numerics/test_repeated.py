@@ -5,10 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
-from nsjax._numerics import _programs, _whole_loops
-from nsjax._numerics._programs import keep_programs, Programs
+from nsjax._numerics import _programs
+from nsjax._numerics._programs import keep_programs
 from nsjax._numerics._repeated import Repeated, Same
 
 
@@ -17,19 +16,6 @@ class Found(NamedTuple):
     good: np.ndarray
     roots: tuple[np.ndarray, np.ndarray]
     count: np.ndarray
-
-
-@pytest.fixture
-def made(monkeypatch):
-    """How often something was compiled."""
-    seen, compile_ = [], Programs._compiled
-
-    def spied(self, *args):
-        seen.append(self)
-        return compile_(self, *args)
-
-    monkeypatch.setattr(Programs, "_compiled", spied)
-    return seen
 
 
 def fn(matrix, given, x):
@@ -51,27 +37,32 @@ def check(found, a, x):
     assert kinds == [(np.ndarray, np.dtype(kind), shape) for kind, shape in shapes]
 
 
-@pytest.mark.parametrize("loops", [False, True])
-def test_results_of_all_kinds(made, loops):
+def test_results_of_all_kinds():
+    traced = []
+
     def told(*args):
-        assert _whole_loops._here.wanted == loops
+        traced.append(args)
         return fn(*args)
 
     repeated = Repeated(told)
     for a in (1.0, 2.0):  # other arrays are no other program
-        at = repeated.at(MATRIX, (jnp.asarray(a), "abc"), loops=loops)
+        at = repeated.at(MATRIX, (jnp.asarray(a), "abc"))
         for x in (np.asarray([1.0, 2.0]), np.asarray([1.0, -2.0])):
             check(at(x), a, x)
-    assert len(made) == 1
+    assert len(traced) == 1
     check(at(np.ones((2, 3))), 2.0, np.ones((2, 3)))
-    assert len(made) == 2
+    assert len(traced) == 2
     jax.clear_caches()
     check(at(np.ones(2)), 2.0, np.ones(2))
-    assert len(made) == 3
-    repeated = Repeated(fn)
-    at = repeated.at(MATRIX, (jnp.asarray(2.0), "abc"), loops=loops)
+    assert len(traced) == 3
     with jax.disable_jit():
         check(at(np.ones(2)), 2.0, np.ones(2))
+
+
+def test_numbers_that_are_equal_and_no_others():
+    """True is 1, and another program."""
+    repeated = Repeated(lambda flag, x: x + (2 if flag is True else 3))
+    assert [float(repeated.at(flag)(np.zeros(()))) for flag in (True, 1, True)] == [2, 3, 2]
 
 
 def test_settings_are_part_of_it():
@@ -82,13 +73,15 @@ def test_settings_are_part_of_it():
             assert at(np.ones(2, np.float32))[1].dtype == wanted
 
 
-def test_kept_from_one_process_to_the_next(made, tmp_path, monkeypatch):
+def test_kept_from_one_process_to_the_next(tmp_path, monkeypatch):
     monkeypatch.setattr(_programs._Place, "folder", None)
     keep_programs(tmp_path)
-    x = np.ones((2, 5))  # of no other test: what comes out of JAX's own cache is not written
+    traced, trace = [], _programs._traced
+    monkeypatch.setattr(_programs, "_traced", lambda *given: traced.append(given) or trace(*given))
+    x = np.ones((2, 5))
     for _ in range(2):
         check(Repeated(fn).at(MATRIX, (jnp.asarray(1.0), "abc"))(x), 1.0, x)
-    assert len(made) == 1 and len(list(tmp_path.iterdir())) == 1
+    assert len(traced) == 1 and len(list(tmp_path.iterdir())) == 1
 
 
 def test_the_same_and_no_equal():

@@ -102,7 +102,7 @@ def correct(
 @ft.lru_cache(maxsize=16)  # for branches that are followed in turn
 def _at(curve: Same, itinerary: Same, fixed: bool = False) -> Callable[..., Any]:
     given = curve.it.on(itinerary.it)
-    return _correct.at(given.fixed if fixed else given, itinerary.it, loops=not given.exactly)
+    return _correct.at(given.fixed if fixed else given, itinerary.it)
 
 
 @Repeated
