@@ -5,7 +5,7 @@ import os
 
 import jax
 
-from .._numerics._programs import keep_programs
+from .._numerics._programs import keep_programs, ROOM
 
 
 BYTES = 1000000000  # that the variables of a loop may have, to be compiled as one function
@@ -25,6 +25,8 @@ def keep_compiled(keep: bool = True) -> None:
         return
     if not given:
         jax.config.update("jax_compilation_cache_dir", str(folder))
+        # JAX then locks the folder, so that no other command reads what this one is writing.
+        jax.config.update("jax_compilation_cache_max_size", ROOM)
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 

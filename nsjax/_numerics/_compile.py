@@ -59,7 +59,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 # times slower: those are compiled by the user's own `jax.jit`, or by `nsjax.sweep`, without them.
 KERNELS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
 # Nothing of LLVM's optimisation takes off another third.
-QUICK = {**KERNELS, "xla_backend_optimization_level": 0}
+QUICK = {**KERNELS, "xla_cpu_experimental_ynn_fusion_type": "", "xla_backend_optimization_level": 0}
 
 
 # Of sweeps: vectors as long as the processor's own, and without the library that makes a kernel of each sum of

@@ -497,6 +497,7 @@ def test_ratio_of_units(unit, other, expected):
     assert ratio(unit, other) == expected
 
 
+@pytest.mark.slow
 def test_the_units_of_a_scene_are_those_of_its_coordinates(tmp_path):
     """Gear rattle: d in metres. Lengths and velocities, on paper and in JSON."""
     file = tmp_path / "numbers.json"

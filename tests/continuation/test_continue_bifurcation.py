@@ -295,7 +295,10 @@ def test_mistakes(wall, change, message):
 @pytest.mark.parametrize(
     "name, system, start, intervals",
     [
-        ("wall", WALL, Motion(-3.0, 0.0), dict(omega=(1.14, 1.16), x_c=(3.9, 4.1), k_f=(0.95, 1.05))),
+        pytest.param(
+            "wall", WALL, Motion(-3.0, 0.0), dict(omega=(1.14, 1.16), x_c=(3.9, 4.1), k_f=(0.95, 1.05)),
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             "duffing", Duffing(), Motion(0.5, 0.0), dict(omega=(0.99, 1.01), F=(0.9, 1.1), c=(0.18, 0.22)),
             marks=pytest.mark.slow,

@@ -648,6 +648,7 @@ def test_larger_systems():
     np.testing.assert_allclose(fold.value, -most.fun, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_orbits_born_at_a_hopf_point():
     """(5.25): radius √d and period 2π/(ω + β d), above only."""
     system = gallery.Hopf(-1.0)

@@ -44,6 +44,7 @@ def buck():
     return nsjax.continue_orbit(orbit.system, orbit, "V_in", (18.0, 31.5), max_laps=2)
 
 
+@pytest.mark.slow
 def test_the_flips_of_a_model_with_a_clock(buck):
     """On an orbit that is passed twice its clock has gone on in the second lap."""
     np.testing.assert_allclose([b.value for b in buck.bifurcations], [24.51657282856, 31.1179020], rtol=1e-8)
@@ -78,6 +79,7 @@ class HeldThroughout(nsjax.System):
         return jnp.pi
 
 
+@pytest.mark.slow
 def test_an_orbit_that_slides_all_along():
     """|x| = V / |(i2)² + 0.2i + 1|; at 3/2 the switch lets go, and the orbit goes on with four events."""
     orbit = nsjax.find_orbit(HeldThroughout(), Held(0.0, 0.0, 0.0))

@@ -137,7 +137,7 @@ def test_lanes(forward, adjoint):
     assert np.isfinite(gradient).all()
 
 
-@pytest.mark.parametrize("adjoint", ADJOINTS)
+@pytest.mark.parametrize("adjoint", ["jacobian", pytest.param("checkpoint", marks=pytest.mark.slow)])
 def test_lanes_that_have_ended(adjoint):
     """Pitfall 18: a lane that has ended goes on with steps of no length, whose NaN must not reach the gradient."""
 

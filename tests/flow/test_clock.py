@@ -283,7 +283,9 @@ class Announced(Jumpy):
         return (Announced.step, Jumpy.gate)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize(
+    "solver", ["Tsit5", *[pytest.param(name, marks=pytest.mark.slow) for name in ("Taylor", "Exponential")]]
+)
 def test_undeclared(solver):
     """A surface that jumps with the state, where nothing tells of it, is found."""
     with pytest.raises(nsjax.SolveError, match="`Jumpy.gate`|`gate`"):

@@ -208,7 +208,8 @@ def sweeps(name):
     return *plain(end, LANES), jax.jit(jax.vmap(lambda w: end(w, Taylor())))(LANES)
 
 
-@pytest.mark.parametrize("name", ["section 6.6", *[pytest.param(n, marks=pytest.mark.slow) for n in list(MODELS)[1:]]])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MODELS)
 def test_against_the_general_flow(name):
     """Every column of the log, of a sweep of which next to nothing is left over."""
     got, left, want = sweeps(name)

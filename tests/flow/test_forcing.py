@@ -41,7 +41,9 @@ class BlockByTable(Block):
         return jnp.interp(t, jnp.asarray(KNOTS), jnp.asarray(VALUES))
 
 
-@pytest.mark.parametrize("model, want", [(Block, [1.625, 1.0]), (BlockByTable, [4.375, 3.75])])
+@pytest.mark.parametrize(
+    "model, want", [(Block, [1.625, 1.0]), pytest.param(BlockByTable, [4.375, 3.75], marks=pytest.mark.slow)]
+)
 def test_a_sweep_does_not_step_over_jumps_and_kinks_of_the_forcing(model, want):
     mus = jnp.array([0.1, 0.2])
     y1 = nsjax.sweep(lambda mu: nsjax.solve(model(mu), 0.0, 6.25, Motion(0.0, 2.0), throw=False).y1, mus)

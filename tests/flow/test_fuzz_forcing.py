@@ -135,7 +135,8 @@ def _failures_and_errors(kind, solver, count, seed, swept=False):
 WITHIN = 2e-5  # of which 1e-6 of time make some
 
 
-@pytest.mark.parametrize("kind", [pytest.param("table", marks=pytest.mark.slow), "square"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["table", "square"])
 def test_random_forcings_in_a_sweep(kind):
     told, error = _failures_and_errors(kind, None, 40, 1, swept=True)
     assert not told.any()

@@ -404,6 +404,7 @@ class Forced(Crossing):
         return 2 * jnp.pi / 1.3
 
 
+@pytest.mark.slow
 def test_an_orbit_through_a_crossed_surface():
     """The flow and its derivative confirm the orbit that shooting finds, and the branch in segments."""
     orbit = nsjax.find_orbit(Forced(), Motion(0.5, 0.5), order=None)
@@ -440,7 +441,7 @@ class TwoDoses(Doses):
         return 2 * self.T
 
 
-@pytest.mark.parametrize("method", ["shooting", "segments"])
+@pytest.mark.parametrize("method", ["shooting", pytest.param("segments", marks=pytest.mark.slow)])
 def test_an_orbit_of_two_doses(method):
     orbit = nsjax.find_orbit(TwoDoses(), Motion(1.0, 1.0), method=method)
     # After the dose of 1 at t = 0, which the one of 3 at t = T follows.

@@ -15,7 +15,7 @@ import nsjax
 from nsjax import gallery
 
 
-QUICK = ("1.1(3)", "6.6")
+QUICK = ("1.1(3)",)
 ERROR = 1e-5  # of times of events and derivatives, relative to the largest, at the tolerance 1e-8
 FORGOTTEN = 5e-7  # the error of a derivative, which is 1 at the start, where hardly anything of it is left
 

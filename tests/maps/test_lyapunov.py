@@ -118,6 +118,7 @@ def test_a_skew_tent():
     assert float(jnp.std(found)) > 0.1
 
 
+@pytest.mark.slow
 def test_decay_of_a_linear_system():
     """A field that jumps by what the other variables do not feel: the exponents are those of the linear parts."""
     exact = diffrax.PIDController(rtol=1e-12, atol=1e-12)

@@ -329,6 +329,7 @@ def test_maximum_of_an_orbit_that_sticks(classic):
     np.testing.assert_allclose(classic.maximum(lambda t, y: -y.v), np.hypot(1, 0.2), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_reverse_mode():
     """With `DirectAdjoint`, as `jax.grad` and optimisers need it; without it is refused, by name."""
 

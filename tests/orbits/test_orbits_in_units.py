@@ -16,6 +16,7 @@ from nsjax.flow._results import is_okay
 
 QUICK = ("3.4", "1.1(2)")  # autonomous and forced
 ORBITS = [key for key in gallery.SYSTEMS if gallery.entry(key).orbit is not None]
+CASES = ["mixed", *[pytest.param(case, marks=pytest.mark.slow) for case in UNITS if case != "mixed"]]
 ERROR = 1e-9  # of periods, states and multipliers, relative to the largest
 
 
@@ -49,18 +50,19 @@ def check(key, case, method):
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(path.y))
 
 
-@pytest.mark.parametrize("case", UNITS)
+@pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("key", QUICK)
 def test_orbits(key, case):
     """Pitfalls 27, 51."""
     check(key, case, "shooting")
 
 
+@pytest.mark.slow
 def test_segments():
     check("1.1(2)", "large numbers", "segments")
 
 
-@pytest.mark.parametrize("case", UNITS)
+@pytest.mark.parametrize("case", CASES)
 def test_without_a_period(case):
     check("3.4", case, "nothing")
 
@@ -75,7 +77,7 @@ def reduced(case=None):
     return float(image.value / system.state.x), float(image.y.v / system.state.v)
 
 
-@pytest.mark.parametrize("case", UNITS)
+@pytest.mark.parametrize("case", CASES)
 def test_reduced_map(case):
     np.testing.assert_allclose(reduced(case), reduced(), rtol=1e-10)
 

@@ -55,6 +55,7 @@ def again(runs, path=None, **options):
     return Sweep(iterated, X, 1.5, path=path or runs._folder.path, **SMALL | options)
 
 
+@pytest.mark.slow
 def test_solutions(tmp_path):
     """What `solve` returns, with systems whose fields differ; those that fail are counted, and can be run again."""
 
