@@ -7,11 +7,11 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool
 
 from ._autodiff import dense_jacobian, frozen
+from ._lapack import LinearSolver, solve
 from ._select import select
 
 
@@ -29,8 +29,9 @@ class Newton(NamedTuple):
     tol: Any  # relative and absolute, of the unknowns; absolute, of the equations
     max_steps: int
 
-    def solver(self, well_posed: bool | None = None) -> optx.Newton:
-        return optx.Newton(rtol=self.tol, atol=self.tol, linear_solver=lx.AutoLinearSolver(well_posed=well_posed))
+    def solver(self, isolated: bool = True) -> optx.Newton:
+        """Optimistix's method. Where roots may not be `isolated` its steps are the shortest ones."""
+        return optx.Newton(rtol=self.tol, atol=self.tol, linear_solver=LinearSolver(isolated))
 
     def step(
         self, z: Array, residual: Array, jacobian: Array, sizes: Sizes = Sizes()
@@ -57,7 +58,7 @@ def find_root(
     newton: Newton,
     *,
     sizes: Sizes = Sizes(),
-    well_posed: bool | None = None,
+    isolated: bool = True,
 ) -> tuple[Any, Bool[Array, ""]]:
     """A root of `residual(z, parameters)` by optimistix's Newton method, and whether it converged.
 
@@ -66,8 +67,8 @@ def find_root(
 
     The root's derivatives with respect to the parameters, of every order, are those of the implicit function. They are
     NaN where there is no root, or where it is not regular: optimistix's own rule raises an error there, which
-    one bad lane of a batch would do for all. Where roots may not be isolated (`well_posed=False`) the steps are the
-    shortest ones.
+    one bad lane of a batch would do for all. Where roots may not be `isolated` the steps are the shortest
+    ones.
     """
     begin, unravel = jfu.ravel_pytree(frozen(guess))
     unknowns, equations = frozen(sizes)
@@ -77,7 +78,7 @@ def find_root(
 
     found = optx.root_find(
         lambda w, p: dense_jacobian(flat, w * unknowns, p) / equations,
-        newton.solver(well_posed),
+        newton.solver(isolated),
         begin / unknowns,
         args=frozen(parameters),
         max_steps=newton.max_steps,
@@ -102,5 +103,4 @@ def _implicit_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     dr = eqx.filter_jvp(lambda f, p: f(z, p), (residual, parameters), (moved, change))[1]
     if dr is None:
         return z, jnp.zeros_like(z)
-    move = lx.linear_solve(lx.MatrixLinearOperator(jacobian), -dr, solver=lx.LU(), throw=False).value
-    return z, select(regular, move, jnp.nan)
+    return z, select(regular, solve(jacobian, -dr), jnp.nan)

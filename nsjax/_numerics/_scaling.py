@@ -4,6 +4,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._lapack import pinv
 from ._root import Sizes
 from ._select import select
 
@@ -20,8 +21,7 @@ def sizes_near(matrix: Float[Array, "m n"], z: Float[Array, " n"]) -> Sizes:
     matrix = select(jnp.isfinite(matrix), matrix, 0)
     rows, columns = equilibrated(matrix)
     scaled, z = rows[:, None] * matrix * columns, jnp.abs(z)
-    inverse = jnp.linalg.pinv(scaled, rtol=SINGULAR)
-    passed = columns * (jnp.abs(inverse) @ (jnp.abs(scaled) @ (z / columns)))
+    passed = columns * (jnp.abs(pinv(scaled, SINGULAR)) @ (jnp.abs(scaled) @ (z / columns)))
     unknowns = jnp.maximum(z, passed)
     unknowns = select(unknowns > 0, unknowns, 1)
     return Sizes(unknowns, jnp.abs(matrix) @ unknowns)

@@ -7,6 +7,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from .._numerics._lapack import eig, inv, qr, solve
 from .._numerics._select import select
 from ..system._system import System
 
@@ -60,7 +61,7 @@ def _qr(a: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, "n n"
     """The QR factorization, for up to three rows by Givens rotations: LAPACK is called lane by lane."""
     n = a.shape[-1]
     if n > 3:
-        return jnp.linalg.qr(a)
+        return qr(a)
     r, q = [a[i] for i in range(n)], [x for x in jnp.eye(n, dtype=a.dtype)]
     for j in range(n - 1):
         for i in range(n - 1, j, -1):
@@ -79,7 +80,7 @@ def eigenvalues(matrix: Float[Array, "n n"]) -> Complex[Array, " n"]:
     (jax's own rule has no second derivative.) Each is improved by Newton's method on (M - μ) v = 0, v₀ᴴ v = 1 from
     where it is known already: every step doubles the order of the derivatives that are right.
     """
-    mu, v = jnp.linalg.eig(lax.stop_gradient(matrix))
+    mu, v = eig(lax.stop_gradient(matrix))
     order = jnp.argsort(-jnp.abs(mu))
     mu, v = mu[order], v[:, order]
     n = len(mu)
@@ -91,7 +92,7 @@ def eigenvalues(matrix: Float[Array, "n n"]) -> Complex[Array, " n"]:
             shifted = square - mu * jnp.eye(n, dtype=mu.dtype)
             bordered = jnp.block([[shifted, -v[:, None]], [norm[None], jnp.zeros((1, 1), mu.dtype)]])
             rest = jnp.append(shifted @ v, norm @ v - 1)
-            move = jnp.linalg.solve(bordered, rest)
+            move = solve(bordered, rest)
             v, mu = v - move[:n], mu - move[n]
         return _valued(value, mu)
 
@@ -152,7 +153,7 @@ def forwards(
     """
     monodromy, multipliers, _ = backwards
     lost = zeros > 0
-    inverse = jnp.linalg.inv(select(lost, jnp.eye(len(monodromy), dtype=monodromy.dtype), monodromy))
+    inverse = inv(select(lost, jnp.eye(len(monodromy), dtype=monodromy.dtype), monodromy))
     vanishes = multipliers == 0
     multipliers = select(vanishes, jnp.inf, 1 / select(vanishes, 1, multipliers))[::-1]
     return select(lost, jnp.inf, inverse), multipliers, stability(multipliers, autonomous)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._numerics._autodiff import frozen
 from .._numerics._compile import interactive
+from .._numerics._lapack import inv, svd
 from .._numerics._root import find_root, Newton
 from .._numerics._scaling import equilibrated, sizes_near
 from .._numerics._select import select
@@ -137,12 +138,12 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, newton: Newton
 
     sizes = sizes_near(jax.jacfwd(flat)(start), start)
     sizes = sizes._replace(equations=select(sizes.equations > 0, sizes.equations, 1))
-    z, converged = find_root(residual, (x0, sigma), system, newton, sizes=sizes, well_posed=False)
+    z, converged = find_root(residual, (x0, sigma), system, newton, sizes=sizes, isolated=False)
     end = jfu.ravel_pytree(frozen(z))[0]
-    error, matrix = flat(end), jax.jacfwd(flat)(end)
+    error, matrix = frozen((flat(end), jax.jacfwd(flat)(end)))
     sizes = sizes_near(matrix, jnp.maximum(jnp.abs(start), jnp.abs(end)))
     rows, columns = equilibrated(matrix)
-    left, singular, right = jnp.linalg.svd(rows[:, None] * matrix * columns)
+    left, singular, right = svd(rows[:, None] * matrix * columns)
     isolated = singular[-1] > 1e-10 * singular[0]
     # Among large numbers rounding keeps Newton's method from ending. (The steps are the shortest ones here, too.)
     inverse = select(singular > 1e-10 * singular[0], 1 / singular, 0)
@@ -204,7 +205,7 @@ def linear_motion(
     # The normals N span a left invariant subspace, N J = T N: that is what being held means. So J - N⁺ (T + D) N has
     # -D for T, and the other eigenvalues of J.
     normal, on = jnp.stack(normals), jnp.stack(taken)
-    inverse = normal.T @ jnp.linalg.inv(normal @ normal.T + jnp.diag(select(on, 0, 1).astype(x.dtype)))
+    inverse = normal.T @ inv(normal @ normal.T + jnp.diag(select(on, 0, 1).astype(x.dtype)))
     far = 10 * (1 + jnp.max(jnp.abs(lax.stop_gradient(jacobian)))) * len(x)
     rates = jnp.diag(far * (1 + jnp.arange(len(normals), dtype=x.dtype)))
     return jacobian, jacobian - inverse @ (normal @ jacobian @ inverse + rates) @ normal, held, attracts

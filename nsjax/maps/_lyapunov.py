@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._numerics._compile import interactive
+from .._numerics._lapack import qr, slogdet
 from .._numerics._select import select
 from .._numerics._text import listed, positive, shown
 from .._types import Scalar, Y
@@ -133,13 +134,13 @@ def _growth_of_volume(system: System, sol: Solution, t0: Scalar, y0: Y, integrat
     if not events.t.size:
         return total
     happened = jnp.arange(events.t.size, dtype=events.num.dtype) < events.num
-    jumps = jnp.linalg.slogdet(saltation_matrices(system, events))[1]
+    jumps = jax.vmap(slogdet)(saltation_matrices(system, events))[1]
     return total + jnp.sum(select(happened, jumps, 0))
 
 
 def _orthogonalised(w: Array) -> tuple[Array, Array]:
     """W = Q R: Q, and the logarithms of the diagonal of R, minus infinity where there is nothing but rounding."""
-    q, r = jnp.linalg.qr(w)
+    q, r = qr(w)
     size = jnp.abs(jnp.diagonal(r))
     rounding = 32 * len(w) * jnp.finfo(w.dtype).eps * jnp.linalg.norm(w)
     nothing = size <= rounding

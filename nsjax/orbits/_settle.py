@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from .._numerics._compile import interactive
+from .._numerics._lapack import eigvals, singular_values
 from .._numerics._select import select
 from .._types import Scalar, Y
 from ..derivatives._flow_map import Directions, flow_map, with_room
@@ -95,7 +96,7 @@ def _far(system: System, t0: Scalar, y0: Y, mode: Any) -> Scalar:
     """A time that no search reaches: in the unit of the largest eigenvalue of the field's derivative."""
     model = SwitchedSystem.forwards(system, t0, y0)
     state, (x, unravel) = at_start(model, t0, y0, mode), jfu.ravel_pytree(y0)
-    rate = jnp.max(jnp.abs(jnp.linalg.eigvals(jax.jacfwd(lambda x: ravel(model.flow(t0, unravel(x), state)))(x))))
+    rate = jnp.max(jnp.abs(eigvals(jax.jacfwd(lambda x: ravel(model.flow(t0, unravel(x), state)))(x))))
     return FAR / select(jnp.isfinite(rate) & (rate > 0), rate, 1)
 
 
@@ -208,7 +209,7 @@ def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
                 n = jax.grad(lambda x, k=k, i=i: model.h(k, t0, unravel(x))[i])(x)
                 n = n / select(jnp.any(n != 0), jnp.linalg.norm(n), 1)
                 matrix = matrix + select(held, size, 0) * jnp.outer(n, n)
-    values = jnp.linalg.svd(matrix, compute_uv=False)
+    values = singular_values(matrix)
     return sticks & (values[-1] <= 1e-9 * values[0])
 
 

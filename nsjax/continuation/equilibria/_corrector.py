@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..._numerics._bracket import bracketed
 from ..._numerics._compile import interactive
+from ..._numerics._lapack import slogdet, solve, svd
 from ..._numerics._linalg import bialternate
 from ..._numerics._root import find_root, Newton
 from ..._numerics._select import select
@@ -42,7 +43,7 @@ class Step(NamedTuple):
 def _tangent(curve: Curve, u: Array, border: Array, mode: Array) -> Array:
     """Of length one, and along `border`."""
     whole = jnp.concatenate([jax.jacfwd(curve.residual)(u, mode), border[None]])
-    tangent = jnp.linalg.solve(whole, jnp.zeros_like(u).at[-1].set(1))
+    tangent = solve(whole, jnp.zeros_like(u).at[-1].set(1))
     return tangent / jnp.linalg.norm(tangent)
 
 
@@ -57,8 +58,8 @@ def _determinants(curve: Curve, u: Array, border: Array, mode: Array) -> tuple[A
     motion = curve.motion(u, mode)
     sums = 2 * bialternate(motion, jnp.eye(len(motion), dtype=u.dtype))
     whole = jnp.concatenate([jax.jacfwd(curve.residual)(u, mode), border[None]])
-    pairs = jnp.linalg.slogdet(sums) if len(motion) > 1 else (jnp.ones((), u.dtype), jnp.zeros((), u.dtype))
-    signs, logs = zip(jnp.linalg.slogdet(whole), pairs)
+    pairs = slogdet(sums) if len(motion) > 1 else (jnp.ones((), u.dtype), jnp.zeros((), u.dtype))
+    signs, logs = zip(slogdet(whole), pairs)
     return jnp.stack(signs), jnp.stack(logs)
 
 
@@ -170,7 +171,7 @@ def on_surface(curve: Curve, u: Array, mode: Array, which: Array) -> Array:
 def branch_point(curve: Curve, u: Array, mode: Array) -> tuple[Array, Bool[Array, ""]]:
     """A simple branch point near `u`: with ψ the left null vector of DF, F + β ψ = 0, ψᵀ DF = 0, |ψ| = 1 are regular
     equations there, where F = 0 itself is not; Moore (1980)."""
-    left = jnp.linalg.svd(jax.jacfwd(curve.residual)(u, mode), full_matrices=False)[0][:, -1]
+    left = svd(jax.jacfwd(curve.residual)(u, mode))[0][:, -1]
 
     def residual(z: tuple, _: Any) -> tuple:
         u, psi, beta = z

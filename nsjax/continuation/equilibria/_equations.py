@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..._numerics._compile import interactive
+from ..._numerics._lapack import eig, inv, solve
 from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...equilibria._equilibrium import (
@@ -236,18 +237,18 @@ def first_lyapunov_coefficient(curve: EquilibriumCurve, u: Array, mode: Array) -
     a = jax.jacfwd(field)(x)
     b = jax.jacfwd(jax.jacfwd(field))(x).astype(complex)
     c = jax.jacfwd(jax.jacfwd(jax.jacfwd(field)))(x).astype(complex)
-    roots, right = jnp.linalg.eig(a)
+    roots, right = eig(a)
     pair = jnp.argmin(select(roots.imag > 0, jnp.abs(roots.real), jnp.inf))
     omega, q = roots[pair].imag, right[:, pair]
-    p = jnp.linalg.inv(right)[pair]  # p q = 1, |q| = 1
+    p = inv(right)[pair]  # p q = 1, |q| = 1
     eye = jnp.eye(len(x), dtype=b.dtype)
 
     def quadratic(v: Array, w: Array) -> Array:
         return jnp.einsum("ijk,j,k", b, v, w)
 
     cubic = jnp.einsum("ijkl,j,k,l", c, q, q, jnp.conj(q))
-    mean = jnp.linalg.solve(a.astype(b.dtype), quadratic(q, jnp.conj(q)))
+    mean = solve(a.astype(b.dtype), quadratic(q, jnp.conj(q)))
     twice = 2 * jax.lax.complex(jnp.zeros_like(omega), omega)
-    double = jnp.linalg.solve(twice * eye - a.astype(b.dtype), quadratic(q, q))
+    double = solve(twice * eye - a.astype(b.dtype), quadratic(q, q))
     terms = cubic - 2 * quadratic(q, mean) + quadratic(jnp.conj(q), double)
     return jnp.real(p @ terms) / (2 * omega)

@@ -6,11 +6,11 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool
 
 from ..._numerics._autodiff import frozen
+from ..._numerics._lapack import solve
 from ..._numerics._root import Newton
 from ..._numerics._select import select
 from ..._numerics._together import together
@@ -129,6 +129,6 @@ def _at_root_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
     df = eqx.filter_jvp(equations, (curve, origin), (dcurve, dorigin))[1]
     df = jnp.zeros_like(u) if df is None else df
-    move = lx.linear_solve(lx.MatrixLinearOperator(linear.df), -df, solver=lx.LU(), throw=False).value
+    move = solve(linear.df, -df)
     move = select(regular, move, jnp.nan)
     return (u, linear), (move, eqx.filter_jvp(linearised, (u, curve, origin), (move, dcurve, dorigin))[1])

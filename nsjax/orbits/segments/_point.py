@@ -8,8 +8,9 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
+from ..._numerics._lapack import slogdet, solve
 from ..._numerics._repeated import Repeated, Same
 from ..._numerics._root import Newton
 from ..._numerics._select import select
@@ -127,6 +128,16 @@ def corrected(
     return _seen(curve, itinerary, last, plane, turns)
 
 
+def _orthonormal(rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
+    """Rows that span the same, in the same order, by the method of Gram and Schmidt."""
+    found: list[Array] = []
+    for row in rows:
+        for _ in range(2 if found else 0):  # the second time, what rounding has left
+            row = row - sum((row @ other) * other for other in found)
+        found.append(row / jnp.linalg.norm(row))
+    return jnp.stack(found)
+
+
 def _seen(curve: OrbitCurve, itinerary: OrbitItinerary, turn: Turn, plane: Plane, turns: bool) -> PointData:
     """All that is seen of a point, at which Newton's method has ended."""
     u, linear, good = turn.u, turn.linear, turn.good
@@ -136,12 +147,9 @@ def _seen(curve: OrbitCurve, itinerary: OrbitItinerary, turn: Turn, plane: Plane
     border, (f, last, df, closing) = plane.normal, linear
     scaled = df / row_sizes(df)[:, None]
     whole = jnp.concatenate([scaled, jnp.atleast_2d(border)])
-    along = jnp.linalg.solve(whole, jnp.eye(len(u), m, m - len(u), dtype=u.dtype)).T
-    if m == 1:
-        along = along / jnp.linalg.norm(along)
-    else:
-        along = jnp.linalg.solve(jnp.linalg.cholesky(along @ along.T), along)
-    branch = jnp.stack(jnp.linalg.slogdet(jnp.concatenate([df, along])))
+    along = solve(whole, jnp.eye(len(u), m, m - len(u), dtype=u.dtype)).T
+    along = _orthonormal(along)
+    branch = jnp.stack(slogdet(jnp.concatenate([df, along])))
     tangent = along.reshape(jnp.shape(border))
 
     factors = factors_of(curve, itinerary, u, df, closing)

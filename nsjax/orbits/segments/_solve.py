@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from ..._numerics._autodiff import frozen
 from ..._numerics._compile import interactive
+from ..._numerics._lapack import inv
 from ..._numerics._root import Newton
 from ..._numerics._select import select
 from ..._types import Scalar
@@ -233,7 +234,7 @@ def _backwards(
     # All but the last piece of a segment end in the middle of it.
     onto = jnp.repeat(jnp.roll(leaves, -1), curve.pieces) & (itinerary.ends == EVENT)
     smooth = itinerary._replace(ends=select(onto, PIECE, itinerary.ends))
-    factors = jnp.linalg.inv(factors_of(curve, smooth, u, linear.df, linear.closing))
+    factors = jax.vmap(inv)(factors_of(curve, smooth, u, linear.df, linear.closing))
     before, after = (
         select(leaves[:, None], *pair)
         for pair in ((events.mode_after, events.mode_before), (events.mode_before, events.mode_after))
