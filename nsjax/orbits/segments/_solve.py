@@ -134,7 +134,7 @@ def _problem(
     f = ravel(still.flow(guess.begin[0], y0, blank.state(rows.mode[0], rows.part[0])))
     normal = f / select(f @ f == 0, 1, f @ f)
     sizes = integrator.sizes_of(jnp.max(jnp.abs(x), axis=0), f, blank.time)
-    curve = frozen(dataclasses.replace(blank, normal=normal, sizes=sizes))
+    curve = dataclasses.replace(blank, normal=frozen(normal), sizes=frozen(sizes))
     curve = dataclasses.replace(curve, guard_sizes=guard_sizes_at(curve, rows, guess.begin, x))
     units = jnp.concatenate([jnp.stack([curve.time, curve.time]), sizes])
     if pieces == 1:
