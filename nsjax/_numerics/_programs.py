@@ -167,7 +167,8 @@ def _traced(fn: Callable[..., Any], given: Any) -> tuple[jexp.Exported, Any] | N
     forms = [form(x) for x in leaves if eqx.is_array(x)]
     try:
         return jexp.export(jax.jit(listed))(forms), skeleton[0]
-    except (ValueError, NotImplementedError):  # it calls Python, or something else that is not portable
+    except (ValueError, NotImplementedError):
+        # `jax.export` refuses programs that call Python. A mistake in the model is raised when `kept` calls `fn` itself.
         return None
 
 
