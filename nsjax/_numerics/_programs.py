@@ -168,7 +168,7 @@ def _traced(fn: Callable[..., Any], given: Any) -> tuple[jexp.Exported, Any] | N
     try:
         return jexp.export(jax.jit(listed))(forms), skeleton[0]
     except (ValueError, NotImplementedError):
-        # `jax.export` refuses programs that call Python. A mistake in the model is raised when `kept` calls `fn` itself.
+        # `jax.export` refuses programs that call Python; a mistake in the model is raised when `kept` calls `fn`.
         return None
 
 
