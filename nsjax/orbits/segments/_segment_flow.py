@@ -67,6 +67,10 @@ class SegmentFlow(eqx.Module):
     def unravel(self, x: Array) -> Y:
         return jfu.ravel_pytree(self.like)[1](x)
 
+    def in_mode(self, state: ModeState) -> ModeFlow:
+        """Returns the flow of one mode as a system whose state is measured in `sizes`."""
+        return ModeFlow(self.model, state, self.unravel(self.sizes))
+
     def field(self, t: Scalar, x: Array, state: ModeState) -> Array:
         model = self.model
         if self.exact and not self.slides:
@@ -90,18 +94,16 @@ class SegmentFlow(eqx.Module):
         a, b, ts = times_between(a, b, THETA)
         if self.exact:
             xs = _samples(self, a, b, x, state)
-            weights = jnp.asarray(WEIGHTS, x.dtype)[:, None] * (b - a)
-            return ts, xs, jnp.stack([jnp.sum(weights * xs, axis=0), jnp.sum(weights * xs**2, axis=0)])
-        span = jnp.abs(b - a)
-        # Of a segment without length every point is its beginning.
-        far = select(span > 0, b, jnp.nextafter(a, jnp.inf))
-        none = jax.tree.map(jnp.zeros_like, self.like)
-        saveat = dfx.SaveAt(subs=dfx.SubSaveAt(ts=select(span > 0, ts, a), fn=lambda t, y, args: y[0]))
-        summed = _Summed(self.model, state, self.unravel(self.sizes))
-        sol = integrate(summed, a, far, (self.unravel(x / self.sizes), none, none), self.relative, saveat=saveat)
-        xs = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys) * self.sizes
-        sums = jnp.stack([jfu.ravel_pytree(part)[0] * self.sizes**k for k, part in enumerate(sol.y1[1:], 1)])
-        return ts, select(span > 0, xs, x), select(span > 0, sums, 0)
+        else:
+            span = jnp.abs(b - a)
+            # Of a segment without length every point is its beginning.
+            far = select(span > 0, b, jnp.nextafter(a, jnp.inf))
+            smooth, saveat = self.in_mode(state), dfx.SaveAt(ts=select(span > 0, ts, a))
+            sol = integrate(smooth, a, far, self.unravel(x / self.sizes), self.relative, saveat=saveat)
+            xs = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys) * self.sizes
+            xs = select(span > 0, xs, x)
+        weights = jnp.asarray(WEIGHTS, x.dtype)[:, None] * (b - a)
+        return ts, xs, jnp.stack([jnp.sum(weights * xs, axis=0), jnp.sum(weights * xs**2, axis=0)])
 
 
 @interactive
@@ -122,14 +124,6 @@ def exactness(model: SwitchedSystem, t: Scalar, y: Y) -> int:
 def states_along(flow: SegmentFlow, a: Scalar, b: Scalar, x: Array, state: ModeState) -> Array:
     """States along a segment, see `SegmentFlow.along`."""
     return flow.along(a, b, x, state)[1]
-
-
-class _Summed(ModeFlow):
-    """The field of one mode, and the integrals of the state and of its square, all in `sizes`."""
-
-    def vector_field(self, t: Scalar, y: Y, s: Any) -> Y:
-        y, _, _ = y
-        return self.field(self.model, t, y), y, jax.tree.map(jnp.square, y)
 
 
 def _exponential(
@@ -174,8 +168,7 @@ def _hermite(s: np.ndarray) -> np.ndarray:
 def _arrive(flow: SegmentFlow, a: Any, b: Any, x: Any, state: Any) -> Array:
     if flow.exact:
         return _exponential(flow, a, b, x, state)[0]
-    smooth = ModeFlow(flow.model, state, flow.unravel(flow.sizes))
-    sol = integrate(smooth, a, b, flow.unravel(x / flow.sizes), flow.relative)
+    sol = integrate(flow.in_mode(state), a, b, flow.unravel(x / flow.sizes), flow.relative)
     return select(is_okay(sol.result), jfu.ravel_pytree(sol.y1)[0] * flow.sizes, jnp.nan)
 
 
