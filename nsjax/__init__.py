@@ -53,6 +53,7 @@ from .flow import (
     Affine as Affine,
     Exponential as Exponential,
     is_okay as is_okay,
+    method_for as method_for,
     RESULTS as RESULTS,
     Solution as Solution,
     solve as solve,

@@ -1,8 +1,9 @@
-"""Lanes that a small program leaves over, for a larger one that is compiled only if there are any.
+"""What a sweep tells the functions that it traces: that the model decides the method, and that a first, smaller program
+may leave lanes over for a second one, which is compiled only if there are any.
 
 What is traced within `first_pass` may say of a lane that it has not worked it out (`left_over`). Whoever calls it takes
 what it returns by `told`, which returns beside it whether anything in the lane was left over, and computes such lanes
-again, without a first pass.
+again, within `whole_pass`.
 """
 
 import functools as ft
@@ -23,7 +24,7 @@ from ._jaxpr import CALLS
 
 
 # (JAX keeps what is traced in one such context apart from what is traced in another.)
-_first = jax.make_user_context(default_value=False)
+_pass = jax.make_user_context(default_value="none")
 
 left_over_p = jex.Primitive("left_over")
 left_over_p.multiple_results = True
@@ -34,11 +35,22 @@ class UnreachableError(Exception):
 
 
 def first_pass() -> AbstractContextManager[None]:
-    return _first(True)
+    """Returns a context for the first program of a sweep."""
+    return _pass("first")
+
+
+def whole_pass() -> AbstractContextManager[None]:
+    """Returns a context for a program of a sweep that leaves no lane over."""
+    return _pass("whole")
 
 
 def is_first_pass() -> bool:
-    return bool(_first.value)
+    return _pass.value == "first"
+
+
+def is_sweep() -> bool:
+    """Whether a function is traced by `nsjax.sweep`."""
+    return _pass.value != "none"
 
 
 def left_over(when: Bool[Array, ""], tree: Any) -> Any:

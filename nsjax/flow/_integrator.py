@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from diffrax._root_finder import use_stepsize_tol
 from jax.core import Tracer
 
-from .._numerics._first_pass import is_first_pass
+from .._numerics._first_pass import is_first_pass, is_sweep
 from .._numerics._select import select
 from .steppers._exponential import AbstractExponential, Affine
 
@@ -68,10 +68,16 @@ class Integrator(NamedTuple):
         return found._replace(open=self.solver is None and self.stepsize_controller is None)
 
     @property
+    def takes_exact(self) -> bool:
+        """Whether models for which there is an exact flow are solved by it: if `Affine` is named, and within a sweep if
+        no method is."""
+        by_model = is_sweep() and self.open and not isinstance(self.adjoint, dfx.RecursiveCheckpointAdjoint)
+        return by_model or isinstance(self.solver, Affine)
+
+    @property
     def may_be_plain(self) -> bool:
-        """Whether a first pass may take the exact flow of affine models."""
-        taken = self.open or isinstance(self.solver, Affine)
-        return is_first_pass() and taken and isinstance(self.adjoint, dfx.ForwardMode)
+        """Whether the exact flow may leave over what is not plain, for a second program."""
+        return is_first_pass() and self.takes_exact and isinstance(self.adjoint, dfx.ForwardMode)
 
     def smallest_size(self, dtype: Any) -> Any:
         """Returns the size below which states of an orbit count as zero: 1 in the unit of the state, unless an `atol`

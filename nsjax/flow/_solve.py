@@ -13,7 +13,7 @@ from jaxtyping import Array, Int
 
 from .._numerics._autodiff import dense_jacobian, forward_only, frozen
 from .._numerics._compile import interactive
-from .._numerics._first_pass import is_first_pass, left_over
+from .._numerics._first_pass import is_sweep, left_over
 from .._numerics._jaxpr import bends_and_jumps, jumps
 from .._numerics._linalg import WRITTEN_OUT
 from .._numerics._merge import merged
@@ -52,7 +52,8 @@ class _Options(NamedTuple):
     throw: bool = False
     meter: dfx.AbstractProgressMeter = dfx.NoProgressMeter()
     still: bool = False  # whether only the state at the end has derivatives
-    plain: bool = False  # whether affine models go by plain events alone, and leave the rest over
+    exact: bool = False  # whether models that have an exact flow are solved by it
+    plain: bool = False  # whether the exact flow goes by plain events alone, and leaves the rest over
 
 
 @interactive
@@ -84,11 +85,9 @@ def _integrate(system: System, t0: Scalar, t1: Scalar, y0: Y, options: _Options)
     state, values, forked, result = start_mode(model, start, y0, options.given, frozen(stop - start))
     # (To end on a surface is not plain: none of a map's solutions would be.)
     plain = options.plain and not any(switch.ends for switch in model.switches)
-    exact = None
-    if plain or isinstance(options.integrator.solver, Affine):
-        exact = planned(model, options.meter, state, start, y0)
+    exact = planned(model, options.meter, state, start, y0) if options.exact else None
     plain = plain and exact is not None
-    if plain:
+    if exact is not None:
         options = options._replace(integrator=options.integrator._replace(solver=Affine()))
     stepper = _stepper(options.integrator).made_for(model, state, start, y0)
     y0 = model.project(start, y0, state, values)  # a change of y0 off the surface that holds it changes nothing
@@ -350,8 +349,9 @@ def solve(
         a repulsive surface that is reached is crossed, and a start on one is refused. `Solution.unique` tells.
     - `solver`: an explicit diffrax Runge-Kutta solver, a diagonally implicit one for stiff fields, Euler,
         `nsjax.Taylor`, or for models that are affine in the state `nsjax.Exponential` or, for sweeps, `nsjax.Affine`.
-        By default `diffrax.Tsit5()`; within `nsjax.sweep` `nsjax.Affine()` for what that can do, where nothing is said
-        of steps (by `stepsize_controller`, `dt0`, `SaveAt(steps=...)` or `SaveAt(dense=True)`).
+        By default `diffrax.Tsit5()`; within `nsjax.sweep` that of `nsjax.method_for`, where nothing is said of steps
+        (by `stepsize_controller`, `dt0`, `SaveAt(steps=...)` or `SaveAt(dense=True)`) and `adjoint` is not
+        `RecursiveCheckpointAdjoint`.
     - `stepsize_controller`: by default `diffrax.PIDController` with `rtol = atol = 1e-8` (1e-5 for float32).
     - `rtol`, `atol`: relative and absolute tolerance of that default controller, if not these; not to be given together
         with `stepsize_controller`.
@@ -377,8 +377,8 @@ def solve(
     integrator = Integrator(solver, stepsize_controller, max_steps, max_events, adjoint).checked(
         t0.dtype, rtol=rtol, atol=atol
     )
-    # Steps and dense output are those of a solver; and only a first pass asks, so that elsewhere it is one program.
-    if dt0 is not None or saveat.dense or Request.of(saveat).steps or not is_first_pass():
+    # Steps and dense output are those of a solver. (Outside of sweeps nobody asks, so that it is one program there.)
+    if dt0 is not None or saveat.dense or Request.of(saveat).steps or not is_sweep():
         integrator = integrator._replace(open=False)
     if throw:
         check_numbers(system, t0, t1, y0)
@@ -390,7 +390,8 @@ def solve(
         dt0 = jnp.abs(jnp.asarray(dt0, t0.dtype))
     concrete = throw and known((system, t0, t1, y0, given, integrator, saveat, dt0))
     within = throw and not concrete  # raised by the compiled program itself
-    options = _Options(given, integrator, saveat, dt0, within, progress_meter, plain=integrator.may_be_plain)
+    how = dict(exact=integrator.takes_exact, plain=integrator.may_be_plain)
+    options = _Options(given, integrator, saveat, dt0, within, progress_meter, **how)
     sol, left = _run(system, t0, t1, y0, options)
     if left is not None:
         return left_over(left, sol)
@@ -416,7 +417,7 @@ def integrate(
 ) -> Solution:
     """`solve` for arguments that have been checked, which never raises. `still`: only `y1` has derivatives, not what is
     saved or logged on the way, which makes a smaller program."""
-    how = dict(still=still, plain=integrator.may_be_plain)
+    how = dict(still=still, exact=integrator.takes_exact, plain=integrator.may_be_plain)
     options = _Options(given_modes(system, mode), integrator.with_arrays(t0.dtype), saveat, **how)
     sol, left = _run(arrays_of(system, t0.dtype), t0, jnp.asarray(t1, t0.dtype), y0, options)
     return sol if left is None else left_over(left, sol)

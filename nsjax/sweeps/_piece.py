@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._numerics._compile import swept, without_collection
-from .._numerics._first_pass import first_pass, told, UnreachableError
+from .._numerics._first_pass import first_pass, told, UnreachableError, whole_pass
 from .._numerics._settings import settings
 from ._devices import Device
 from ._lanes import Lanes
@@ -157,7 +157,8 @@ def _program_for(static: Any, shared: Any, mapped: Any, how: _How, first: bool) 
         if first:
             with contextlib.suppress(UnreachableError), first_pass():
                 return Program(_function(static, how, told), forms, how.devices)
-        return Program(_function(static, how, lambda fn: lambda *args: (fn(*args), None)), forms, how.devices)
+        with whole_pass():
+            return Program(_function(static, how, lambda fn: lambda *args: (fn(*args), None)), forms, how.devices)
 
     forms = jax.tree.map(form, shared), jax.tree.map(rows, mapped), form(np.int32(0))
     (own, own_tree), (flat, tree) = jax.tree.flatten(static), jax.tree.flatten(forms)

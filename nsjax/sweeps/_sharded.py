@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from .._numerics._first_pass import whole_pass
 from .._numerics._text import known
 from ._chunks import in_chunks
 from ._lanes import default_chunk, Lanes
@@ -62,7 +63,8 @@ def _run(fn: Callable[..., Any], mapped: Any, rest: Any, chunk: int, mesh: Any, 
 
     def share(shared: Any, mapped: Any) -> Any:
         fn, rest = eqx.combine(shared, static)
-        return in_chunks(fn, mapped, rest, chunk)
+        with whole_pass():
+            return in_chunks(fn, mapped, rest, chunk)
 
     # (Loops of diffrax's step control mix what differs between devices with what does not, which the check refuses.)
     specs = PartitionSpec(), PartitionSpec(axes)

@@ -1,6 +1,7 @@
 """`sweep`: a function of one lane applied to many, in chunks of a size at which a processor is fastest."""
 
 import contextlib
+import functools as ft
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from .._numerics._compile import eager, interactive, long_running, MANY
-from .._numerics._first_pass import first_pass, told, UnreachableError
+from .._numerics._first_pass import first_pass, told, UnreachableError, whole_pass
 from .._numerics._progress import Counting, ProgressMeter, QUIET, Told
 from .._numerics._text import known, positive
 from ._chunks import in_chunks
@@ -24,8 +25,17 @@ PIECES = 64  # of a sweep, from which on a piece is of several chunks: each cost
 
 Tell = Callable[[int], Any]
 
-_run = long_running(in_chunks)
-_few = interactive(in_chunks, host=True)
+
+@long_running
+def _run(fn: Callable[..., Any], mapped: Any, rest: Any, chunk: int) -> Any:
+    with whole_pass():
+        return in_chunks(fn, mapped, rest, chunk)
+
+
+@ft.partial(interactive, host=True)
+def _few(fn: Callable[..., Any], mapped: Any, rest: Any, chunk: int) -> Any:
+    with whole_pass():
+        return in_chunks(fn, mapped, rest, chunk)
 
 
 @long_running
@@ -52,8 +62,9 @@ def sweep(
     y1 = nsjax.sweep(final, jnp.linspace(0.1, 1.0, 4096))  # y1.x has shape (4096,)
     ```
 
-    Called directly, it solves models that are affine between events by `nsjax.Affine` if no solver is named, and by the
-    general flow those lanes in which something is not plain: `fn` is traced a second time for them.
+    If `fn` names no solver, models are solved by that of `nsjax.method_for`: `nsjax.Affine` where the model is affine
+    between events. Called directly, a sweep does so by a small program first; `fn` is traced a second time for lanes in
+    which something is not plain.
 
     Derivatives go through it (`jax.jacfwd`, and `jax.grad` if `fn` allows it), and it may stand within `jax.jit`.
     For sweeps that take hours there is `Sweep`, which keeps what it has done.

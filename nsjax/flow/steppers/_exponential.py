@@ -104,11 +104,10 @@ class Affine(AbstractExponential):
     one body), for which this is `Exponential`. Stops and springs, of any number of components, are taken for switches
     that are only crossed: where one holds after all, the general loop has it. Tolerances play no role.
 
-    Within `nsjax.sweep` it is the default. There what is plain is a program of its own, that is compiled sooner
-    than others; lanes that it leaves over are computed again with the general loop, by a second program, which is
-    compiled if there are any. Sweeps of small systems take a tenth to a twenty-fifth of the time of `Exponential`. In a
-    `vmap`, or a sweep over a mesh, within `jax.jit` or a derivative, both are one program, which takes longest of all
-    to compile; there it has to be named.
+    It is the default of `nsjax.sweep` for such models, see `nsjax.method_for`. A sweep that is called directly compiles
+    a small program of the plain events first, and one that holds the general loop as well only if some lanes need it.
+    Everywhere else there is only the second program, which takes longer to compile than that of any other solver.
+    Sweeps of small systems take a tenth to a twenty-fifth of the time of `Exponential`.
     """
 
 
