@@ -18,7 +18,6 @@ from jaxtyping import Array, Float
 from .._types import Scalar
 from ._barrier import once
 from ._select import select
-from ._together import together
 
 
 NODES = 40  # parts of a piece: they resolve a phase of 7.6, somewhat more than a period
@@ -143,7 +142,7 @@ def minima(
 
     # (A function that is NaN counts as resolved, so that the walk ends. The second condition follows from the first:
     # of a loop whose condition depends on one number alone, XLA would look for a count of the turns, which takes long.)
-    return lax.while_loop(lambda walk: (walk.begin < 1) & (walk.width > 0), step, together(start)).minima
+    return lax.while_loop(lambda walk: (walk.begin < 1) & (walk.width > 0), step, start).minima
 
 
 def places_of(rows: list[list[Any]]) -> np.ndarray:

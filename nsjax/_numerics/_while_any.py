@@ -9,8 +9,6 @@ import jax
 import jax.lax as lax
 from jaxtyping import Array, Bool
 
-from ._together import together
-
 
 T = TypeVar("T")
 
@@ -32,7 +30,7 @@ def while_any(
 
     # (Equinox's loop would have three copies of each number of the carry in its program, and again in derivatives.)
     if checkpointed is None:
-        arrays = lax.while_loop(some, turn, together(arrays))
+        arrays = lax.while_loop(some, turn, arrays)
     else:
         arrays = eqxi.while_loop(some, turn, arrays, kind="checkpointed", **checkpointed)
     return eqx.combine(arrays, rest)

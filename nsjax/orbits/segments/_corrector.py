@@ -13,7 +13,6 @@ from ..._numerics._autodiff import frozen
 from ..._numerics._lapack import solve
 from ..._numerics._root import Newton
 from ..._numerics._select import select
-from ..._numerics._together import together
 from ..._types import Scalar
 from ._equations import OrbitCurve
 from ._itinerary import OrbitItinerary
@@ -82,7 +81,7 @@ def newton_turns(
     blank = Linear(*(jnp.zeros(shape, guess.dtype) for shape in ((size - m,), (rows, n), (size - m, size), (size,))))
     ended, no, none = ~jnp.asarray(newton), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
     first = Turn(guess, guess, blank, ended, good=no, over=no, spoilt=no, count=none)
-    return lax.while_loop(lambda c: ~c.over & (c.count <= method.max_steps), turn, together(first))
+    return lax.while_loop(lambda c: ~c.over & (c.count <= method.max_steps), turn, first)
 
 
 def linear_at(curve: OrbitCurve, itinerary: OrbitItinerary, u: Array, origin: Array) -> Linear:

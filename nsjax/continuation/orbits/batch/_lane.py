@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ...._numerics._select import select
-from ...._numerics._together import together
 from ...._types import Scalar
 from ....orbits.segments._corrector import Plane
 from ....orbits.segments._equations import OrbitCurve
@@ -129,7 +128,7 @@ def follow_lane(
         moved = _moved(curve, itinerary, lane, ends, upwards, max_step)
         return jax.tree.map(lambda new, old: select(going(lane), new, old), moved, lane)
 
-    return lax.while_loop(going, step, together(lane))
+    return lax.while_loop(going, step, lane)
 
 
 def _written(lane: Lane, row: Row, arc: Scalar, kind: Any, when: Bool[Array, ""]) -> Lane:
