@@ -7,7 +7,7 @@ again, within `whole_pass`.
 """
 
 import functools as ft
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -19,8 +19,8 @@ import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool
 
+from ._evaluation import bound, called, Evaluation, within
 from ._inner import scan_counts
-from ._jaxpr import CALLS
 
 
 # (JAX keeps what is traced in one such context apart from what is traced in another.)
@@ -88,15 +88,15 @@ def told(fn: Callable[..., Any]) -> Callable[..., tuple[Any, Bool[Array, ""] | N
             lambda *xs: fn(*eqx.combine(jax.tree.unflatten(tree, xs), static)), return_shape=True
         )(*flat)
         said: list[Any] = []
-        out = _evaluated(closed.jaxpr, [*closed.consts, *flat], said)
+        out = _evaluated(closed, flat, said)
         return jax.tree.unflatten(jax.tree.structure(form), out), ft.reduce(jnp.logical_or, said) if said else None
 
     return call
 
 
-def _says(jaxpr: jex.Jaxpr) -> bool:
-    """Whether a program may leave something over."""
-    return any(e.primitive is left_over_p or any(map(_says, jex.jaxprs_in_params(e.params))) for e in jaxpr.eqns)
+def _says(e: Any) -> bool:
+    """Whether an operation leaves something over."""
+    return e.primitive is left_over_p
 
 
 def _called(e: Any, x: list[Any], said: list[Any]) -> list[Any]:
@@ -104,11 +104,11 @@ def _called(e: Any, x: list[Any], said: list[Any]) -> list[Any]:
 
     def of(closed: jex.ClosedJaxpr, *x: Any) -> tuple[list[Any], Any]:
         own: list[Any] = [jnp.zeros((), bool)]
-        out = _evaluated(closed.jaxpr, [*closed.consts, *x], own)
+        out = _evaluated(closed, x, own)
         return out, ft.reduce(jnp.logical_or, own)
 
-    if e.primitive.name in CALLS:
-        (inner,) = (p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr))
+    inner = called(e)
+    if inner is not None:
         out, own = of(inner, *x)
     elif e.primitive.name == "cond":
         out, own = lax.switch(x[0], [ft.partial(of, branch) for branch in e.params["branches"]], *x[1:])
@@ -129,21 +129,12 @@ def _called(e: Any, x: list[Any], said: list[Any]) -> list[Any]:
     return out
 
 
-def _evaluated(jaxpr: jex.Jaxpr, values: list[Any], said: list[Any]) -> list[Any]:
-    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], values))
-
-    def read(v: Any) -> Any:
-        return v.val if isinstance(v, jex.Literal) else env[v]
-
-    for e in jaxpr.eqns:
-        x = [read(v) for v in e.invars]
-        if e.primitive is left_over_p:
+def _evaluated(closed: jex.ClosedJaxpr, values: Sequence[Any], said: list[Any]) -> list[Any]:
+    program = Evaluation(closed, values, lambda x, aval: x)
+    for e, x in program:
+        if _says(e):
             said.append(x[0])
-            out = x[1:]
-        elif any(map(_says, jex.jaxprs_in_params(e.params))):
-            out = _called(e, x, said)
+            program.put(e, x[1:])
         else:
-            out = e.primitive.bind(*x, **e.primitive.get_bind_params(e.params))
-            out = out if e.primitive.multiple_results else [out]
-        env.update(zip(e.outvars, out))
-    return [read(v) for v in jaxpr.outvars]
+            program.put(e, _called(e, x, said) if within(e, _says) else bound(e, x))
+    return program.results

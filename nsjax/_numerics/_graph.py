@@ -3,16 +3,15 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.extend.core as jex
 import numpy as np
 
+from ._evaluation import called, Evaluation, has_programs
 from ._jaxpr import ELEMENTWISE, MOVING
 
 
 FEW = 4  # numbers that are worth an array, at least
 MANY = 4096  # numbers in an array that is taken apart, at most
-_INLINED = ("jit", "pjit", "closed_call")
 _MOVES = frozenset(MOVING) - {"reduce_sum"}  # operations that only move numbers
 _COLLECTS = ("concatenate", "split", "stack")  # of which arrays of single numbers are made
 
@@ -158,27 +157,17 @@ class Graph:
         self.outs = self._read(closed, arguments)
 
     def _read(self, closed: jex.ClosedJaxpr, arguments: list[Value]) -> list[Value]:
-        jaxpr = closed.jaxpr
-        known: dict[Any, Value] = dict(zip(jaxpr.invars, arguments, strict=True))
-        known.update((v, Value.constant(c, v.aval)) for v, c in zip(jaxpr.constvars, closed.consts, strict=True))
-
-        def value(v: Any) -> Value:
-            return Value.constant(v.val, v.aval) if isinstance(v, jex.Literal) else known[v]
-
-        for e in jaxpr.eqns:
-            ins, name = [value(v) for v in e.invars], e.primitive.name
-            outs = None
-            if name in _INLINED:
-                outs = self._read(e.params.get("jaxpr") or e.params["call_jaxpr"], ins)
-            elif name in self.handlers:
-                outs = self.handlers[name](self, e, ins)
+        program = Evaluation(closed, arguments, Value.constant)
+        for e, ins in program:
+            inner, handler = called(e, with_rules=False), self.handlers.get(e.primitive.name)
+            outs = self._read(inner, ins) if inner is not None else handler(self, e, ins) if handler else None
             if outs is None:
                 node = self.add(ins, e, [v.aval for v in e.outvars], e.params)
-                if any(isinstance(p, jex.ClosedJaxpr | jex.Jaxpr) for p in jax.tree.leaves(list(e.params.values()))):
-                    node.bind = _alone(jaxpr, e)
+                if has_programs(e):
+                    node.bind = _alone(closed.jaxpr, e)
                 outs = _moved(node, e.params) or node.outs
-            known.update(zip(e.outvars, outs, strict=True))
-        return [value(v) for v in jaxpr.outvars]
+            program.put(e, outs)
+        return program.results
 
     def add(self, ins: list[Value], e: Any, avals: Sequence[Any], params: Mapping[str, Any]) -> Node:
         """An operation with these operands and results in place of the equation `e`."""

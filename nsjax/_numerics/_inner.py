@@ -10,6 +10,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 from jax.interpreters import ad
 
+from ._evaluation import Evaluation
 from ._undocumented import lower_jaxpr2
 
 
@@ -40,18 +41,12 @@ def replacing(primitive: jex.Primitive) -> None:
 def batched_outputs(closed: jex.ClosedJaxpr, batched: Sequence[bool]) -> list[bool]:
     """Which outputs depend on the inputs that are batched."""
     # Forwards, once. (To ask `dce_jaxpr` what each output needs took an eighth of all tracing of derivatives.)
-    jaxpr = closed.jaxpr
-    known = {v for v, b in zip(jaxpr.invars, batched, strict=True) if b}
-
-    def marked(variables: Sequence[Any]) -> list[bool]:
-        return [not isinstance(v, jex.Literal) and v in known for v in variables]
-
-    for eqn in jaxpr.eqns:
-        have = marked(eqn.invars)
-        if any(have):
-            found = REACHED.get(eqn.primitive.name, _all)(have, eqn.params, len(eqn.outvars))
-            known.update(v for v, r in zip(eqn.outvars, found, strict=True) if r)
-    return marked(jaxpr.outvars)
+    program = Evaluation(closed, batched, lambda x, aval: False)
+    for e, have in program:
+        count = len(e.outvars)
+        reached = REACHED.get(e.primitive.name, _all)(have, e.params, count) if True in have else [False] * count
+        program.put(e, reached)
+    return program.results
 
 
 def _all(have: list[bool], params: Any, outs: int) -> list[bool]:

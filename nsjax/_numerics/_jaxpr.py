@@ -7,12 +7,12 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
+from ._evaluation import called, Evaluation
 
-CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
+
 # Each entry of the result depends on the same entry of the operands.
 ELEMENTWISE = frozenset(
     "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy cos cosh "
@@ -67,37 +67,35 @@ MOVING: dict[str, Callable[..., Any]] = {
 Mask = np.ndarray  # of truth values, or of integers with a bit for each of many; as large as what it tells of
 
 
-def _masks(jaxpr: Any, inputs: list[Mask], leapt: list[Mask] | None = None) -> tuple[list[Mask], list[Mask]]:
+def _none(aval: Any) -> Mask:
+    return np.zeros(getattr(aval, "shape", ()), bool)
+
+
+def _masks(closed: Any, inputs: list[Mask], leapt: list[Mask] | None = None) -> tuple[list[Mask], list[Mask]]:
     """Which entries of the results depend on the marked entries of the inputs, and which by way of an operation that
     jumps (or on the entries that are marked as `leapt` already); too many rather than too few."""
-    known = dict(zip(jaxpr.invars, zip(inputs, leapt or [np.zeros_like(m) for m in inputs])))
-
-    def read(v: Any) -> tuple[Mask, Mask]:
-        none = np.zeros(getattr(v.aval, "shape", ()), bool)
-        return (none, none) if isinstance(v, jex.Literal) else known.get(v, (none, none))
-
-    for e in jaxpr.eqns:
-        pairs, name = [read(v) for v in e.invars], e.primitive.name
-        have, leaps = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-        inner = [p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr)]
-        if name in CALLS and len(inner) == 1 and any(m.any() for m in have):
-            out = _masks(inner[0].jaxpr, have, leaps)
+    pairs = list(zip(inputs, leapt or [np.zeros_like(m) for m in inputs]))
+    program = Evaluation(closed, pairs, lambda x, aval: (_none(aval), _none(aval)))
+    for e, pairs in program:
+        have, leaps, name = [pair[0] for pair in pairs], [pair[1] for pair in pairs], e.primitive.name
+        inner = called(e)
+        if inner is not None and any(m.any() for m in have):
+            out = _masks(inner, have, leaps)
         else:
             out = _passed_on(e, have), _passed_on(e, leaps)
             real = any(m.any() and jnp.issubdtype(v.aval.dtype, jnp.inexact) for v, m in zip(e.invars, have))
             whole = any(not jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in e.outvars)
             if real and (name in _JUMPING or (whole and name != "is_finite")):
                 out = out[0], out[0]
-        known.update(zip(e.outvars, zip(*out)))
-    pairs = [read(v) for v in jaxpr.outvars]
-    return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+        program.put(e, list(zip(*out)))
+    return [pair[0] for pair in program.results], [pair[1] for pair in program.results]
 
 
 def _passed_on(e: Any, have: list[Mask]) -> list[Mask]:
     """Which entries of the results of an operation depend on the marked entries of its operands."""
     name = e.primitive.name
     if not any(m.any() for m in have):
-        return [np.zeros(getattr(v.aval, "shape", ()), bool) for v in e.outvars]
+        return [_none(v.aval) for v in e.outvars]
     if name in ELEMENTWISE:
         return [_either(*np.broadcast_arrays(*have))]
     if name in MOVING:
@@ -112,8 +110,8 @@ def _passed_on(e: Any, have: list[Mask]) -> list[Mask]:
 
 def _of_leaves(fn: Callable[[Any], Any], x: Any) -> tuple[list[bool], list[bool]]:
     """Which leaves of `fn(x)` depend on `x`, and which by way of an operation that jumps."""
-    jaxpr = jax.make_jaxpr(fn)(x).jaxpr
-    reached, leapt = _masks(jaxpr, [np.ones(v.aval.shape, bool) for v in jaxpr.invars])
+    closed = jax.make_jaxpr(fn)(x)
+    reached, leapt = _masks(closed, [np.ones(a.shape, bool) for a in closed.in_avals])
     return [bool(m.any()) for m in reached], [bool(m.any()) for m in leapt]
 
 
@@ -147,12 +145,12 @@ def is_affine(fn: Callable[[Any], Any], x: Any) -> bool:
 
 def dependence(fn: Callable[[Any], Any], x: Any) -> np.ndarray:
     """Which results of `fn`, scalars, may depend on which numbers of `x`: booleans `(results, numbers)`."""
-    jaxpr = jax.make_jaxpr(fn)(x).jaxpr
-    shapes = [v.aval.shape for v in jaxpr.invars]
-    ends = np.cumsum([0, *[v.aval.size for v in jaxpr.invars]])
+    closed = jax.make_jaxpr(fn)(x)
+    shapes = [a.shape for a in closed.in_avals]
+    ends = np.cumsum([0, *[a.size for a in closed.in_avals]])
     bits = np.array([1 << i for i in range(ends[-1])], object)  # integers of Python: of any number of bits
     masks = [bits[start:end].reshape(shape) for start, end, shape in zip(ends, ends[1:], shapes)]
-    found = [int(_union(m)) for m in _masks(jaxpr, masks)[0]]
+    found = [int(_union(m)) for m in _masks(closed, masks)[0]]
     return np.array([[bool(marks & bit) for bit in bits] for marks in found], bool).reshape(len(found), len(bits))
 
 
@@ -166,21 +164,19 @@ _KEEPING_SIGN = frozenset(MOVING) | frozenset(
 def never_negative(fn: Callable[[Any], Any], x: Any) -> list[bool]:
     """Which leaves of `fn(x)` are sums, products and the like of squares, absolute values and exponentials, so that
     they cannot be negative whatever `x` is."""
-    jaxpr = jax.make_jaxpr(fn)(x).jaxpr
-    return _never_negative(jaxpr, [False] * len(jaxpr.invars))
+    closed = jax.make_jaxpr(fn)(x)
+    return _never_negative(closed, [False] * len(closed.in_avals))
 
 
-def _never_negative(jaxpr: Any, inputs: list[bool]) -> list[bool]:
-    known = dict(zip(jaxpr.invars, inputs))
+def _never_negative(closed: Any, inputs: list[bool]) -> list[bool]:
+    def constant(x: Any, aval: Any) -> bool:
+        return not isinstance(x, jax.Array) and bool(np.all(np.asarray(x) >= 0))
 
-    def read(v: Any) -> bool:
-        return bool(np.all(np.asarray(v.val) >= 0)) if isinstance(v, jex.Literal) else known.get(v, False)
-
-    for e in jaxpr.eqns:
-        name, have = e.primitive.name, [read(v) for v in e.invars]
-        inner = [p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr)]
-        if name in CALLS and len(inner) == 1:
-            out = _never_negative(inner[0].jaxpr, have)
+    program = Evaluation(closed, inputs, constant)
+    for e, have in program:
+        name, inner = e.primitive.name, called(e)
+        if inner is not None:
+            out = _never_negative(inner, have)
         elif name == "select_n":
             out = [all(have[1:])]
         elif name == "max":
@@ -192,5 +188,5 @@ def _never_negative(jaxpr: Any, inputs: list[bool]) -> list[bool]:
         else:
             even = name == "integer_pow" and e.params["y"] % 2 == 0
             out = [name in _NOT_NEGATIVE or even or (name in _KEEPING_SIGN and all(have))]
-        known.update(zip(e.outvars, out if len(out) == len(e.outvars) else out * len(e.outvars)))
-    return [read(v) for v in jaxpr.outvars]
+        program.put(e, out if len(out) == len(e.outvars) else out * len(e.outvars))
+    return program.results

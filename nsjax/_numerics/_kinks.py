@@ -15,13 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ._series import _CALLS
+from ._evaluation import anywhere, called, Evaluation
 
 
 _KINKS: dict[str, Callable[..., Any]] = {"abs": jnp.abs, "max": jnp.maximum, "min": jnp.minimum, "clamp": lax.clamp}
 _IDLE = {"max": -np.inf, "min": np.inf}  # bounds that never act
 _PARTIAL = ("pow", "sqrt", "rsqrt", "log", "log1p", "acos", "asin", "acosh", "atanh")
-_INLINED = ("jit", "pjit", "closed_call")
 _SMOOTH = ("hypot", "logaddexp", "logaddexp2")  # functions of JAX that are smooth, but written with kinks
 
 # One evaluation serves to list kinks, to give the h of one of them (it goes no further), and to put signs in. So it is
@@ -40,8 +39,8 @@ def _has_kink(e: Any) -> bool:
 
 def _is_call(e: Any) -> bool:
     """Whether it is a function that is only written apart, as `jnp.flip` is."""
-    inner = [jaxpr.debug_info.func_name for jaxpr in jex.jaxprs_in_params(e.params)]
-    return e.primitive.name in _INLINED and len(inner) == 1 and inner[0] not in _SMOOTH
+    inner = called(e, with_rules=False)
+    return inner is not None and inner.jaxpr.debug_info.func_name not in _SMOOTH
 
 
 def _is_known(x: Any) -> bool:
@@ -61,22 +60,17 @@ def _once(seen: Seen, name: Any, fn: Callable[..., Any], *x: Any, params: Any = 
     return seen[key][0]
 
 
-def _walk(jaxpr: Any, values: list[Any], seen: Seen) -> Walk:
+def _walk(closed: jex.ClosedJaxpr, values: list[Any], seen: Seen) -> Walk:
     """Evaluates a program."""
-    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], values))
-
-    def read(v: Any) -> Any:
-        return env[v] if isinstance(v, jex.Var) else np.asarray(v.val, v.aval.dtype)
-
-    for e in jaxpr.eqns:
-        x, name = [read(v) for v in e.invars], e.primitive.name
+    program = Evaluation(closed, values, lambda x, aval: x if isinstance(x, jax.Array) else np.asarray(x, aval.dtype))
+    for e, x in program:
+        name, inner = e.primitive.name, called(e)
         if not (_has_kink(e) or _is_call(e)):
             bind = ft.partial(e.primitive.bind, **e.primitive.get_bind_params(e.params))
             out = bind(*x) if e.effects else _once(seen, (name, str(e.params)), bind, *x, params=e.params)
             out = out if e.primitive.multiple_results else [out]
-        elif name in _CALLS:
-            (inner,) = (p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr))
-            out = yield from _walk(inner.jaxpr, [*inner.consts, *x], seen)
+        elif inner is not None:
+            out = yield from _walk(inner, x, seen)
         elif name == "clamp":
             raised = yield from _kink("max", [x[1], x[0]], seen)
             out = [(yield from _kink("min", [raised, x[2]], seen))]
@@ -88,8 +82,8 @@ def _walk(jaxpr: Any, values: list[Any], seen: Seen) -> Walk:
                 "number of times. Write the vector field without the loop or branch, or declare the kink as a `sgn` "
                 "switch."
             )
-        env.update(zip(e.outvars, out))
-    return [read(v) for v in jaxpr.outvars]
+        program.put(e, out)
+    return program.results
 
 
 def _kink(kind: str, x: list[Any], seen: Seen) -> Walk:
@@ -116,8 +110,7 @@ def _kink(kind: str, x: list[Any], seen: Seen) -> Walk:
 def evaluate(fn: Callable[..., Any], *args: Any, seen: Seen | None = None) -> Walk:
     """Evaluates a function of pytrees of arrays."""
     closed, out = jax.make_jaxpr(fn, return_shape=True)(*args)
-    values = [*closed.consts, *jax.tree.leaves(args)]
-    found = yield from _walk(closed.jaxpr, values, {} if seen is None else seen)
+    found = yield from _walk(closed, jax.tree.leaves(args), {} if seen is None else seen)
     return jax.tree.unflatten(jax.tree.structure(out), [jnp.asarray(x) for x in found])
 
 
@@ -128,9 +121,4 @@ def has_kinks(fn: Callable[..., Any], *args: Any) -> bool:
 def is_partial(fn: Callable[..., Any], *args: Any) -> bool:
     """Whether a function has parts that are not defined for all numbers, as powers are not for negative ones. (That
     quotients are not either does not count.)"""
-
-    def within(jaxpr: Any) -> bool:
-        inner = (j for e in jaxpr.eqns for j in jex.jaxprs_in_params(e.params))
-        return any(e.primitive.name in _PARTIAL for e in jaxpr.eqns) or any(map(within, inner))
-
-    return within(jax.make_jaxpr(fn)(*args).jaxpr)
+    return anywhere(jax.make_jaxpr(fn)(*args).jaxpr, lambda e: e.primitive.name in _PARTIAL)

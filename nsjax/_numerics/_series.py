@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Array
 
 from ._barrier import once
+from ._evaluation import called, Evaluation
 from ._select import select
 
 
 Coefficient = Array | None  # None is zero
 
-_CALLS = frozenset("jit pjit closed_call core_call custom_jvp_call custom_vjp_call custom_vjp_call_jaxpr".split())
 # Linear in all of their operands.
 _LINEAR = frozenset(
     "neg add add_any sub broadcast_in_dim reshape squeeze slice transpose concatenate reduce_sum rev copy stack pad "
@@ -105,34 +105,22 @@ class Series:
         self.terms: list[list[Coefficient]] = []  # of each value met, by its number
         self.inner: dict[tuple, Series] = {}
         self.seen: dict[Any, list[int]] = {}
-        constants = [self.number([c]) for c in closed.consts]
         self.inputs = [self.number([]) for _ in self.jaxpr.invars]
-        self.outputs = self.inline(self.jaxpr, [*constants, *self.inputs])
+        self.outputs = self.inline(closed, self.inputs)
 
     def number(self, terms: list[Coefficient]) -> int:
         self.terms.append(terms)
         return len(self.terms) - 1
 
-    def inline(self, jaxpr: Any, values: list[int]) -> list[int]:
+    def inline(self, closed: jex.ClosedJaxpr, values: list[int]) -> list[int]:
         """Lists the equations of a program, those of the functions it calls included, equal ones once."""
-        env = dict(zip([*jaxpr.constvars, *jaxpr.invars], values))
-
-        def read(v: Any) -> int:
-            return self.number([v.val]) if isinstance(v, jex.Literal) else env[v]
-
-        for e in jaxpr.eqns:
-            operands = [read(v) for v in e.invars]
-            short = _expansion(e)
-            if e.primitive.name in _CALLS:
-                inner = next(p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr))
-                results = self.inline(inner.jaxpr, [*[self.number([c]) for c in inner.consts], *operands])
-            elif short is not None:
+        program = Evaluation(closed, values, lambda x, aval: self.number([x]))
+        for e, operands in program:
+            inner, short = called(e), _expansion(e)
+            if short is not None:
                 inner = jax.make_jaxpr(short)(*[jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in e.invars])
-                results = self.inline(inner.jaxpr, [*[self.number([c]) for c in inner.consts], *operands])
-            else:
-                results = self.enlist(e, operands)
-            env.update(zip(e.outvars, results))
-        return [read(v) for v in jaxpr.outvars]
+            program.put(e, self.enlist(e, operands) if inner is None else self.inline(inner, operands))
+        return program.results
 
     def enlist(self, e: Any, operands: list[int]) -> list[int]:
         def name(i: int) -> Any:

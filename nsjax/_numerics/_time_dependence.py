@@ -13,7 +13,8 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
-from ._jaxpr import CALLS, MOVING
+from ._evaluation import bound, called, Evaluation, has_programs, within
+from ._jaxpr import MOVING
 from ._select import select
 
 
@@ -174,27 +175,20 @@ class _Reader:
         self.memory: dict[Any, Any] = {}
 
     def program(self, closed: Any, values: list[Any]) -> list[Any]:
-        return self.inner(closed.jaxpr, [*map(self._constant, closed.consts), *values])
+        program = Evaluation(closed, values, self._constant)
+        for e, x in program:
+            program.put(e, self.equation(e, x))
+        return program.results
 
-    def inner(self, jaxpr: Any, values: list[Any]) -> list[Any]:
-        env: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], values))
-
-        def read(v: Any) -> Any:
-            aval: Any = v.aval
-            return self._constant(np.asarray(v.val, aval.dtype)) if isinstance(v, jex.Literal) else env[v]
-
-        for e in jaxpr.eqns:
-            env.update(zip(e.outvars, self.equation(e, [read(v) for v in e.invars])))
-        return [read(v) for v in jaxpr.outvars]
-
-    def _constant(self, x: Any) -> Constant:
+    def _constant(self, x: Any, aval: Any) -> Constant:
+        x = x if isinstance(x, jax.Array) else np.asarray(x, aval.dtype)
         small = isinstance(x, np.ndarray) and x.size <= 16
         key = ("number", x.dtype.str, x.shape, x.tobytes()) if small else ("array", id(x))
         return self.memory.setdefault(key, Constant(x))
 
     def equation(self, e: Any, x: list[Any]) -> list[Any]:
         """The descriptions of the results of one operation."""
-        params = id(e) if _has_programs(e) else str(e.params)
+        params = id(e) if has_programs(e) else str(e.params)
         key = (e.primitive.name, params, *map(id, x))
         if key not in self.memory:
             self.memory[key] = self._described(e, x), x, e  # these are kept, so that no other object has their `id`
@@ -203,13 +197,13 @@ class _Reader:
     def _described(self, e: Any, x: list[Any]) -> list[Any]:
         name, count = e.primitive.name, len(e.outvars)
         if all(isinstance(v, Constant) for v in x):
-            out = e.primitive.bind(*[v.value for v in x], **e.primitive.get_bind_params(e.params))
-            return [Constant(v) for v in (out if e.primitive.multiple_results else [out])]
-        if name in CALLS:
-            return self._call(e, x)
+            return [Constant(v) for v in bound(e, [v.value for v in x])]
+        inner = called(e)
+        if inner is not None:
+            return self._call(e, inner, x)
         if name == "cond":
             return self._branches(e, x)
-        if _has_programs(e):
+        if has_programs(e):
             return self._loop(e, x)
         if any(v is STATE for v in x):
             return [STATE] * count
@@ -217,9 +211,8 @@ class _Reader:
 
     # Programs within the program.
 
-    def _call(self, e: Any, x: list[Any]) -> list[Any]:
-        jaxpr, *_ = jex.jaxprs_in_params(e.params)
-        name = jaxpr.debug_info.func_name
+    def _call(self, e: Any, inner: jex.ClosedJaxpr, x: list[Any]) -> list[Any]:
+        name = inner.jaxpr.debug_info.func_name
         if len(x) == 2 and not any(v is STATE for v in x):
             whole = name in ("remainder", "floor_divide") and _is_real(e.invars[0].aval)
             if whole and isinstance(x[1], Constant):
@@ -230,8 +223,7 @@ class _Reader:
                 knots = jnp.asarray(x[0].value)
                 self._levels(x[1], knots.reshape(knots.shape + (1,) * len(e.invars[1].aval.shape)), name)
                 return [_STILL]
-        closed = [p for p in e.params.values() if isinstance(p, jex.ClosedJaxpr)]
-        return self.inner(jaxpr, [*map(self._constant, closed[0].consts if closed else ()), *x])
+        return self.program(inner, x)
 
     def _branches(self, e: Any, x: list[Any]) -> list[Any]:
         index, operands = x[0], x[1:]
@@ -240,7 +232,7 @@ class _Reader:
 
     def _loop(self, e: Any, x: list[Any]) -> list[Any]:
         moves = [isinstance(v, Timed) and not v.still and _is_real(a.aval) for v, a in zip(x, e.invars)]
-        if any(moves) and any(map(_may_jump, jex.jaxprs_in_params(e.params))):
+        if any(moves) and within(e, _may_jump):
             self.unknown.append(e.primitive.name)
         if any(v is STATE for v in x):
             return [STATE] * len(e.outvars)
@@ -347,18 +339,9 @@ def _is_real(x: Any) -> bool:
     return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
-def _has_programs(e: Any) -> bool:
-    return any(True for _ in jex.jaxprs_in_params(e.params))
-
-
-def _may_jump(jaxpr: Any) -> bool:
-    """Whether a program compares or rounds real numbers."""
-    for e in jaxpr.eqns:
-        if e.primitive.name in _JUMPING and any(_is_real(v.aval) for v in e.invars):
-            return True
-        if any(map(_may_jump, jex.jaxprs_in_params(e.params))):
-            return True
-    return False
+def _may_jump(e: Any) -> bool:
+    """Whether an operation compares or rounds real numbers."""
+    return e.primitive.name in _JUMPING and any(_is_real(v.aval) for v in e.invars)
 
 
 def _quotient(a: Any, b: Any) -> Any:
@@ -428,11 +411,9 @@ def _moved(e: Any, x: list[Any]) -> list[Form | None]:
     if not (whole and alike) or name not in MOVING or name in ("pad", "reduce_sum"):
         return none
     shapes = [v.aval.shape for v in e.invars]
-    params = e.primitive.get_bind_params(e.params)
 
     def moved(part: str) -> list[Any]:
-        out = e.primitive.bind(*[jnp.broadcast_to(getattr(f, part), s) for f, s in zip(forms, shapes)], **params)
-        return list(out) if e.primitive.multiple_results else [out]
+        return bound(e, [jnp.broadcast_to(getattr(f, part), s) for f, s in zip(forms, shapes)])
 
     if name in ("broadcast_in_dim", "reshape", "squeeze") and shapes[0] == e.outvars[0].aval.shape:
         return [first]  # the same arrays, and not some that are equal
