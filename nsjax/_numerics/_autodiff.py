@@ -5,12 +5,10 @@ from typing import Any, NoReturn
 
 import equinox as eqx
 import jax
-import jax.extend.core as jex
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-from jax.interpreters import ad, batching, mlir
 
-from ._undocumented import primitive_linearizations
+from ._operation import Operation
 
 
 def frozen(tree: Any) -> Any:
@@ -18,33 +16,31 @@ def frozen(tree: Any) -> Any:
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
-forward_only_p = jex.Primitive("forward_only")
-
-
 def forward_only(tree: Any, message: str) -> Any:
     """`tree`, on whose arrays reverse-mode differentiation raises an error with `message`.
 
     Put around the inputs of a loop: JAX gives up on a `while_loop` before it would reach anything behind it.
     """
-    return jax.tree.map(lambda x: forward_only_p.bind(x, message=message) if eqx.is_inexact_array(x) else x, tree)
+    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
+    flat, form = jax.tree.flatten(arrays)
+    if not flat:
+        return tree
+    return eqx.combine(jax.tree.unflatten(form, FORWARD_ONLY.bind(*flat, message=message)), rest)
 
 
-def _refuse(*args: Any, message: str, **kwargs: Any) -> NoReturn:
+def _refuse(message: str) -> NoReturn:
     raise TypeError(message)
 
 
-forward_only_p.def_impl(lambda x, message: x)
-forward_only_p.def_abstract_eval(lambda x, message: x)
-ad.primitive_jvps[forward_only_p] = lambda primals, tangents, message: (
-    forward_only_p.bind(*primals, message=message),
-    *tangents,
+FORWARD_ONLY = Operation(
+    "forward_only",
+    run=lambda *xs, message: list(xs),
+    shapes=lambda *xs, message: list(xs),
+    batch=lambda xs, dims, message: (FORWARD_ONLY.bind(*xs, message=message), list(dims)),
+    jvp=lambda xs, tangents, message: (FORWARD_ONLY.bind(*xs, message=message), list(tangents)),
+    reached=lambda have, message: have,
+    refuse=_refuse,
 )
-primitive_linearizations[forward_only_p] = _refuse
-batching.primitive_batchers[forward_only_p] = lambda args, dims, message: (
-    forward_only_p.bind(*args, message=message),
-    *dims,
-)
-mlir.register_lowering(forward_only_p, lambda ctx, x, message: [x])
 
 
 def dense_jacobian(fn: Callable[..., Any], *args: Any) -> Any:

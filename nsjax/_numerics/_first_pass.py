@@ -16,18 +16,15 @@ import jax
 import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
-from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool
 
 from ._evaluation import bound, called, Evaluation, within
 from ._inner import scan_counts
+from ._operation import Operation
 
 
 # (JAX keeps what is traced in one such context apart from what is traced in another.)
 _pass = jax.make_user_context(default_value="none")
-
-left_over_p = jex.Primitive("left_over")
-left_over_p.multiple_results = True
 
 
 class UnreachableError(Exception):
@@ -57,25 +54,28 @@ def left_over(when: Bool[Array, ""], tree: Any) -> Any:
     """`tree`, on whose arrays whatever is made of them depends, so that what is said of it is not lost."""
     dynamic, static = eqx.partition(tree, eqx.is_array)
     flat, form = jax.tree.flatten(dynamic)
-    return eqx.combine(jax.tree.unflatten(form, left_over_p.bind(when, *flat)), static)
+    return eqx.combine(jax.tree.unflatten(form, LEFT_OVER.bind(when, *flat)), static)
 
 
 def _batch(args: Any, dims: Any) -> tuple[list[Any], list[Any]]:
     when, dim = args[0], dims[0]
     if dim is not None:  # a batch within the lane
         when = jnp.any(when, axis=dim)
-    return left_over_p.bind(when, *args[1:]), list(dims[1:])
+    return LEFT_OVER.bind(when, *args[1:]), list(dims[1:])
 
 
 def _jvp(primals: Any, tangents: Any) -> tuple[list[Any], list[Any]]:
-    return left_over_p.bind(*primals), list(tangents[1:])
+    return LEFT_OVER.bind(*primals), list(tangents[1:])
 
 
-left_over_p.def_impl(lambda when, *xs: list(xs))
-left_over_p.def_abstract_eval(lambda when, *xs: list(xs))
-batching.primitive_batchers[left_over_p] = _batch
-ad.primitive_jvps[left_over_p] = _jvp
-mlir.register_lowering(left_over_p, lambda ctx, when, *xs: list(xs))
+LEFT_OVER = Operation(
+    "left_over",
+    run=lambda when, *xs: list(xs),
+    shapes=lambda when, *xs: list(xs),
+    batch=_batch,
+    jvp=_jvp,
+    reached=lambda have: have[1:],
+)
 
 
 def told(fn: Callable[..., Any]) -> Callable[..., tuple[Any, Bool[Array, ""] | None]]:
@@ -96,7 +96,7 @@ def told(fn: Callable[..., Any]) -> Callable[..., tuple[Any, Bool[Array, ""] | N
 
 def _says(e: Any) -> bool:
     """Whether an operation leaves something over."""
-    return e.primitive is left_over_p
+    return LEFT_OVER.is_in(e)
 
 
 def _called(e: Any, x: list[Any], said: list[Any]) -> list[Any]:

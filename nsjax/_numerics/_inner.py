@@ -1,4 +1,4 @@
-"""What primitives that carry functions need of them: their jaxprs with all that they close over as arguments, which
+"""What operations that carry functions need of them: their jaxprs with all that they close over as arguments, which
 results a batch of arguments reaches, and their derivatives."""
 
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad
 
 from ._evaluation import Evaluation
-from ._undocumented import lower_jaxpr2
+from ._operation import REACHED
 
 
 Flat = Callable[..., list[Any]]  # of arrays, to arrays
@@ -27,26 +27,19 @@ def opened(closed: jex.ClosedJaxpr) -> jex.ClosedJaxpr:
     return jex.ClosedJaxpr(free, ())
 
 
-def replacing(primitive: jex.Primitive) -> None:
-    """For a primitive with a jaxpr: some functions of JAX are primitives that it replaces by others before it compiles
-    (`jnp.searchsorted`, from 0.12 on), and that may stand within."""
-
-    def replaced(*args: Any, jaxpr: jex.ClosedJaxpr, **params: Any) -> Any:
-        return primitive.bind(*args, jaxpr=lower_jaxpr2(jaxpr), **params)
-
-    if lower_jaxpr2 is not None:
-        primitive.to_lojax = replaced  # type: ignore[method-assign]
-
-
 def batched_outputs(closed: jex.ClosedJaxpr, batched: Sequence[bool]) -> list[bool]:
     """Which outputs depend on the inputs that are batched."""
     # Forwards, once. (To ask `dce_jaxpr` what each output needs took an eighth of all tracing of derivatives.)
     program = Evaluation(closed, batched, lambda x, aval: False)
     for e, have in program:
         count = len(e.outvars)
-        reached = REACHED.get(e.primitive.name, _all)(have, e.params, count) if True in have else [False] * count
-        program.put(e, reached)
+        program.put(e, _reached(e, have) if True in have else [False] * count)
     return program.results
+
+
+def _reached(e: Any, have: list[bool]) -> list[bool]:
+    name, count = e.primitive.name, len(e.outvars)
+    return REACHED[name](have, **e.params) if name in REACHED else _OF_JAX.get(name, _all)(have, e.params, count)
 
 
 def _all(have: list[bool], params: Any, outs: int) -> list[bool]:
@@ -99,7 +92,7 @@ def _until_it_stays(
 
 
 # Of primitives that have jaxprs: from what reaches their arguments, which results are reached.
-REACHED: dict[str, Callable[[list[bool], Any, int], list[bool]]] = {
+_OF_JAX: dict[str, Callable[[list[bool], Any, int], list[bool]]] = {
     "jit": _of_call,
     "pjit": _of_call,
     "cond": _of_cond,

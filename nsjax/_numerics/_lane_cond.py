@@ -12,17 +12,14 @@ import jax
 import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad
 
-from ._inner import batched_outputs, mapped, moving, opened, pushed_forward, REACHED, replacing, spread, with_zeros
+from ._inner import batched_outputs, mapped, moving, opened, pushed_forward, spread, with_zeros
+from ._operation import Operation
 from ._select import select
 
 
 GROUP = 32  # lanes worked on together, at least; a kernel costs as much to start as for some hundred lanes
-
-
-compact_cond_p = jex.Primitive("compact_cond")
-compact_cond_p.multiple_results = True
 
 
 def compact_cond(pred: Any, branch: Callable[..., Any], args: Any, default: Any, group: int = GROUP) -> Any:
@@ -31,7 +28,7 @@ def compact_cond(pred: Any, branch: Callable[..., Any], args: Any, default: Any,
     flat, tree = jax.tree.flatten(args)
     closed, out = jax.make_jaxpr(lambda *xs: branch(*jax.tree.unflatten(tree, xs)), return_shape=True)(*flat)
     other = [jnp.asarray(d, o.dtype) for d, o in zip(jax.tree.leaves(default), jax.tree.leaves(out), strict=True)]
-    results = compact_cond_p.bind(pred, *closed.consts, *flat, *other, jaxpr=opened(closed), group=group)
+    results = COMPACT_COND.bind(pred, *closed.consts, *flat, *other, jaxpr=opened(closed), group=group)
     return jax.tree.unflatten(jax.tree.structure(out), results)
 
 
@@ -40,7 +37,7 @@ def _split(args: Any, jaxpr: jex.ClosedJaxpr) -> tuple[list, list]:
     return list(args[:n]), list(args[n:])
 
 
-def _impl(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr, group: int) -> list[Any]:
+def _run(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr, group: int) -> list[Any]:
     inputs, default = _split(args, jaxpr)
     return lax.cond(pred, lambda: list(jex.jaxpr_as_fun(jaxpr)(*inputs)), lambda: default)
 
@@ -100,19 +97,13 @@ def _jvp(primals: Any, tangents: Any, *, jaxpr: jex.ClosedJaxpr, group: int) -> 
     return out, with_zeros(out, kept, change)
 
 
-def _reached(have: list[bool], params: Any, outs: int) -> list[bool]:
-    inputs, default = _split(have[1:], params["jaxpr"])
-    return [have[0] or a or b for a, b in zip(batched_outputs(params["jaxpr"], inputs), default)]
+def _reached(have: list[bool], *, jaxpr: jex.ClosedJaxpr, group: int) -> list[bool]:
+    inputs, default = _split(have[1:], jaxpr)
+    return [have[0] or a or b for a, b in zip(batched_outputs(jaxpr, inputs), default)]
 
 
 def _shapes(pred: Any, *args: Any, jaxpr: jex.ClosedJaxpr, group: int) -> list[Any]:
     return list(jaxpr.out_avals)
 
 
-compact_cond_p.def_impl(_impl)
-compact_cond_p.def_abstract_eval(_shapes)
-batching.primitive_batchers[compact_cond_p] = _batch
-ad.primitive_jvps[compact_cond_p] = _jvp
-mlir.register_lowering(compact_cond_p, mlir.lower_fun(_impl, multiple_results=True))
-replacing(compact_cond_p)
-REACHED["compact_cond"] = _reached
+COMPACT_COND = Operation("compact_cond", run=_run, shapes=_shapes, batch=_batch, jvp=_jvp, reached=_reached)

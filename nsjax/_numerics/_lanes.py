@@ -5,27 +5,22 @@ a polynomial) is not vectorised over them. A loop that is written for lanes can 
 a time, whose numbers stay in the cache, and does not wait for the slowest of all.
 """
 
-import functools as ft
 import itertools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.core
-import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
-from jax.interpreters import ad, batching, mlir
 
 from ._inner import Flat, mapped, moving, pushed_forward, spread, with_zeros
+from ._operation import Operation
 from ._products import full_products
 
 
 Levels = tuple[tuple[int, int], ...]
 """How many arguments and results there are: of the function itself, with its first tangents, and so on."""
-
-in_lanes_p = jex.Primitive("in_lanes")
-in_lanes_p.multiple_results = True
 
 
 def in_lanes(fn: Callable[..., Any], chunk: int, *args: Any) -> Any:
@@ -40,7 +35,7 @@ def in_lanes(fn: Callable[..., Any], chunk: int, *args: Any) -> Any:
 
     shapes = tuple((o.shape[:-1], o.dtype) for o in jax.tree.leaves(form))
     flat = [jnp.asarray(x) for x in flat]
-    results = in_lanes_p.bind(*flat, fn=listed, shapes=shapes, levels=((len(flat), len(shapes)),), chunk=chunk)
+    results = IN_LANES.bind(*flat, fn=listed, shapes=shapes, levels=((len(flat), len(shapes)),), chunk=chunk)
     return jax.tree.unflatten(jax.tree.structure(form), results)
 
 
@@ -48,7 +43,7 @@ def _one(x: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct((*jnp.shape(x), 1), jnp.result_type(x))
 
 
-def _impl(*args: Any, fn: Flat, shapes: Any, levels: Levels, chunk: int) -> list[Any]:
+def _run(*args: Any, fn: Flat, shapes: Any, levels: Levels, chunk: int) -> list[Any]:
     return [x[..., 0] for x in fn(*[jnp.asarray(x)[..., None] for x in args])]
 
 
@@ -88,7 +83,7 @@ def _batch(
     count = next(outs for (_, outs), (inputs, _) in zip(levels, levels[1:]) if any(batched[:inputs]))
     wide = [i >= count for i in range(len(shapes))]
     new = tuple(((size, *s) if w else s, d) for (s, d), w in zip(shapes, wide))
-    results = in_lanes_p.bind(*front, fn=mapped(fn, size, batched, wide), shapes=new, levels=levels, chunk=chunk)
+    results = IN_LANES.bind(*front, fn=mapped(fn, size, batched, wide), shapes=new, levels=levels, chunk=chunk)
     return results, [0 if w else None for w in wide]
 
 
@@ -101,7 +96,7 @@ def _jvp(
     moves = [tangents[i] for i in smooth]
     wider = (*shapes, *[shapes[i] for i in kept])
     levels = (*levels, (len(primals) + len(moves), len(wider)))
-    results = in_lanes_p.bind(*primals, *moves, fn=both, shapes=wider, levels=levels, chunk=chunk)
+    results = IN_LANES.bind(*primals, *moves, fn=both, shapes=wider, levels=levels, chunk=chunk)
     count = len(shapes)
     return results[:count], with_zeros(results[:count], kept, results[count:])
 
@@ -110,8 +105,4 @@ def _shapes(*args: Any, fn: Flat, shapes: Any, levels: Levels, chunk: int) -> li
     return list(itertools.starmap(jax.core.ShapedArray, shapes))
 
 
-in_lanes_p.def_impl(ft.partial(_impl))
-in_lanes_p.def_abstract_eval(_shapes)
-batching.primitive_batchers[in_lanes_p] = _batch
-ad.primitive_jvps[in_lanes_p] = _jvp
-mlir.register_lowering(in_lanes_p, mlir.lower_fun(_impl, multiple_results=True))
+IN_LANES = Operation("in_lanes", run=_run, shapes=_shapes, batch=_batch, jvp=_jvp)

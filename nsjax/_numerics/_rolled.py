@@ -12,14 +12,11 @@ from typing import Any
 import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
-from jax.interpreters import ad, batching, mlir, partial_eval as pe
+from jax.interpreters import partial_eval as pe
 
-from ._inner import batched_outputs, Flat, mapped, moving, opened, pushed_forward, REACHED, replacing, with_zeros
+from ._inner import batched_outputs, Flat, mapped, moving, opened, pushed_forward, with_zeros
+from ._operation import Operation
 from ._products import full_products
-
-
-rolled_p = jex.Primitive("rolled")
-rolled_p.multiple_results = True
 
 
 def rolled(
@@ -48,11 +45,11 @@ def rolled(
 def bound(inputs: list[Any], loop: Callable[..., Any], written_out: Flat, own: tuple[bool, ...]) -> Any:
     """`own` says which inputs are arguments, and no tangents."""
     jaxpr, form = jax.make_jaxpr(loop, return_shape=True)(*inputs)
-    results = rolled_p.bind(*inputs, jaxpr=jaxpr, written_out=written_out, own=own)
+    results = ROLLED.bind(*inputs, jaxpr=jaxpr, written_out=written_out, own=own)
     return jax.tree.unflatten(jax.tree.structure(form), results)
 
 
-def _impl(*inputs: Any, jaxpr: jex.ClosedJaxpr, written_out: Flat, own: tuple[bool, ...]) -> list[Any]:
+def _run(*inputs: Any, jaxpr: jex.ClosedJaxpr, written_out: Flat, own: tuple[bool, ...]) -> list[Any]:
     return jex.jaxpr_as_fun(jaxpr)(*inputs)
 
 
@@ -82,11 +79,8 @@ def _jvp(
     return results[:count], with_zeros(results[:count], kept, results[count:])
 
 
-def _pruned(used: list[bool], *given: Any) -> tuple[list[bool], Any]:
+def _pruned(used: list[bool], eqn: Any) -> tuple[list[bool], Any]:
     """Without the results that nobody uses, and what only they need: else primals would seem to depend on tangents."""
-    eqn = given[-1]  # after which arguments are alive, in later versions of JAX
-    if not any(used):
-        return [False] * len(eqn.invars), None
     params = eqn.params
     closed, written_out, avals = params["jaxpr"], params["written_out"], params["jaxpr"].in_avals
     jaxpr, needed = pe.dce_jaxpr(closed.jaxpr, used)
@@ -108,11 +102,12 @@ def _pruned(used: list[bool], *given: Any) -> tuple[list[bool], Any]:
     return needed, new
 
 
-rolled_p.def_impl(_impl)
-rolled_p.def_abstract_eval(lambda *_, jaxpr, written_out, own: list(jaxpr.out_avals))
-batching.primitive_batchers[rolled_p] = _batch
-ad.primitive_jvps[rolled_p] = _jvp
-pe.dce_rules[rolled_p] = _pruned
-mlir.register_lowering(rolled_p, mlir.lower_fun(_impl, multiple_results=True))
-replacing(rolled_p)
-REACHED["rolled"] = lambda have, params, outs: batched_outputs(params["jaxpr"], have)
+ROLLED = Operation(
+    "rolled",
+    run=_run,
+    shapes=lambda *_, jaxpr, written_out, own: list(jaxpr.out_avals),
+    batch=_batch,
+    jvp=_jvp,
+    reached=lambda have, jaxpr, written_out, own: batched_outputs(jaxpr, have),
+    prune=_pruned,
+)

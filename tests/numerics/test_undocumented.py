@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import nsjax
-from nsjax._numerics import _compile, _inner, _lane_cond, _undocumented
-from nsjax._numerics._autodiff import primitive_linearizations
+from nsjax._numerics import _compile, _lane_cond, _operation, _undocumented
+from nsjax._numerics._autodiff import FORWARD_ONLY
 from nsjax._numerics._compile import interactive
 
 
@@ -61,26 +61,16 @@ def test_without_linearizations(monkeypatch):
     slope = jax.grad(lambda t1: nsjax.solve(entry.system(), 0.0, t1, entry.orbit.y0).y1.x)
     with pytest.raises(TypeError, match="DirectAdjoint"):
         slope(1.0)
-    monkeypatch.delitem(primitive_linearizations, _undocumented_primitive())
+    monkeypatch.delitem(_operation.primitive_linearizations, FORWARD_ONLY.primitive)
     jax.clear_caches()
     with pytest.raises(ValueError, match="reverse-mode autodiff"):
         slope(1.0)
 
 
-def _undocumented_primitive():
-    (primitive,) = [p for p in primitive_linearizations if p.name == "forward_only"]
-    return primitive
-
-
 def test_without_lowering_of_jaxprs(monkeypatch):
     """Primitives with functions within are as they were, and work as long as these are made of plain primitives."""
-    monkeypatch.setattr(_inner, "lower_jaxpr2", None)
-    primitive = jax.extend.core.Primitive("with_a_function")
-    before = getattr(primitive, "to_lojax", None)
-    _inner.replacing(primitive)
-    assert getattr(primitive, "to_lojax", None) == before
-    if "to_lojax" in vars(_lane_cond.compact_cond_p):
-        monkeypatch.delattr(_lane_cond.compact_cond_p, "to_lojax")
+    if "to_lojax" in vars(_lane_cond.COMPACT_COND.primitive):
+        monkeypatch.delattr(_lane_cond.COMPACT_COND.primitive, "to_lojax")
     x = jnp.arange(3.0)
     root = jax.vmap(lambda x: _lane_cond.compact_cond(x > 0.5, lambda x: (jnp.sqrt(x),), (x,), (x,))[0])
     np.testing.assert_allclose(jax.jit(root)(x), np.sqrt([0, 1, 2]), rtol=1e-15)
