@@ -1,6 +1,9 @@
 """Nothing for nothing: a model pays only for what it contains, read off its jaxpr."""
 
 import functools
+import pathlib
+import subprocess
+import sys
 
 import diffrax as dfx
 import jax
@@ -179,6 +182,7 @@ class Row(nsjax.System):
     """Bodies in a row, each with a stop at the one before it."""
 
     number: int = 2
+    restitution: float = 0.6
 
     def vector_field(self, t, y, s):
         forces = jnp.stack([s[f"gap{i}"] for i in range(self.number)])
@@ -193,7 +197,7 @@ class Row(nsjax.System):
 def _gaps(number):
     def gap(i):
         switch = nsjax.impact(lambda self, t, y: y.x[i] - (y.x[i - 1] if i else 0.0), name=f"gap{i}")
-        return switch.restitution(lambda self: 0.6)
+        return switch.restitution(lambda self: self.restitution)
 
     return tuple(map(gap, range(number)))
 
@@ -210,6 +214,37 @@ def test_programs_of_contacts_grow_with_their_number():
 
     few, many = equations(6), equations(12)
     assert many < 1.6 * few, (few, many)
+
+
+STRESS = """
+import sys; sys.path[:0] = {path}
+import jax, jax.numpy as jnp, numpy as np, nsjax
+jax.config.update("jax_enable_x64", True)
+from test_cost import Row
+from nsjax.gallery import Motion
+
+def end(height):
+    y0 = Motion(jnp.arange(1.0, 7) + height, jnp.zeros(6))
+    return nsjax.solve(Row(6, 0.0), 0.0, 5.0, y0, throw=False, max_events=200).y1
+
+lanes, heights = jax.jit(jax.vmap(end)), jnp.linspace(0, 0.5, 512)
+for _ in range(30):
+    found = jax.block_until_ready(lanes(heights))
+np.testing.assert_allclose(found.x, 0, atol=1e-9)  # the bodies are points
+np.testing.assert_allclose(found.v, 0, atol=1e-9)
+alone = jax.jit(end)(heights[100])
+np.testing.assert_allclose(np.stack(alone), np.stack(found)[:, 100], atol=1e-12)
+print("done")
+"""
+
+
+@pytest.mark.slow
+def test_batches_of_crowded_events_come_to_their_end():
+    """Pitfall 60: six bodies that fall on each other and stay there. A batch whose lanes choose between two ways of
+    looking for the modes stood still, when the linear systems within were those of LAPACK."""
+    code = STRESS.replace("{path}", repr([str(pathlib.Path(__file__).parent), *sys.path]))
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=400)
+    assert run.returncode == 0 and run.stdout == "done\n", run.stderr
 
 
 def test_multipliers_are_not_taken_to_jump():

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from ..._numerics._autodiff import frozen
+from ..._numerics._lane_cond import compact_cond
 from ..._numerics._linalg import nearly
 from ..._numerics._select import select
 from ..._types import Scalar, Y
@@ -226,11 +227,12 @@ def _jointly(here: Instant, trial: dict) -> _Choice:
     which, crowded = here.which, len(here.which) > _TRIED
     held = here.look(trial) if here.model.contacts or crowded else None
     noise = here.noise(held.s if held else {})
-    found = _best(here, trial, noise)
     if held is not None and crowded:
-        # Both are worked out: with a `cond` between them batches of such models came to a standstill.
         more = sum(here.at[k].astype(jnp.int32) for k in which) > _TRIED
-        found = jax.tree.map(ft.partial(select, more), _search(here, trial, held, noise, more), found)
+        search = ft.partial(_search, here, trial, held, noise, more)
+        found = compact_cond(more, search, (), _best(here, trial, noise))
+    else:
+        found = _best(here, trial, noise)
     trial, seen, others, wrong = found
     return _Choice(trial, seen, dict(zip(which, others)), wrong, noise)
 
