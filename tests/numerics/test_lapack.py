@@ -37,7 +37,7 @@ PAIRS = {
 
 def check(found, want):
     for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9 * np.max(np.abs(y), initial=1e-300))
+        np.testing.assert_allclose(x, y, rtol=1e-11, atol=1e-11 * np.max(np.abs(y), initial=1e-300))
 
 
 @pytest.mark.parametrize("name", PAIRS)
@@ -72,7 +72,7 @@ def test_solver_of_lineax(regular):
     right = a @ B[0]
     operator = lx.MatrixLinearOperator(jnp.asarray(a))
     found = lx.linear_solve(operator, jnp.asarray(right), _lapack.LinearSolver(regular), throw=False).value
-    np.testing.assert_allclose(found, np.linalg.pinv(a) @ right, rtol=1e-9)
+    np.testing.assert_allclose(found, np.linalg.pinv(a) @ right, rtol=1e-11)
 
 
 # jaxlib's estimates of the work for one matrix (n, m): jaxlib/cpu/lapack_kernels.cc.
