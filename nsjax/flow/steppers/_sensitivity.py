@@ -22,7 +22,7 @@ from ..._numerics._barrier import once, stored
 from ..._numerics._jaxpr import is_constant
 from ..._numerics._select import select
 from ..._types import Scalar, Y
-from ...system._mode import ModeState
+from ...system._mode import ModeState, put
 from ...system._model import SwitchedSystem
 
 
@@ -101,22 +101,26 @@ def _trusted_jvp(primals: Any, tangents: Any) -> tuple[Scalar, Scalar]:
     ratios = jax.tree.map(lambda e, size: jnp.max(jnp.abs(e) / (floor + rtol * size)), stored(errors), sizes)
     worst = once(ft.reduce(jnp.maximum, jax.tree.leaves(ratios)))  # for each direction, not in one kernel for all
     lane = sum(jnp.sum(x) for x in jax.tree.leaves(step.y))
-    worst = once(_of_all_directions(select(step.kept & (worst < jnp.inf), worst, 0), lane) / SLACK)
+    worst = select(step.kept & (worst < jnp.inf), worst, 0) / SLACK
+    own, worst = worst > 1, once(_of_all_directions(worst, lane))
     # Far below the tolerance the error of one step says little of the next.
     far = select(worst > 0.1, step.length * jnp.maximum(worst, 0.1) ** (-1 / order), jnp.inf)
-    far = jnp.maximum(far, _surely(worst > 1, step, frozen(tangents[0]).model, lane))
+    far = jnp.maximum(far, _surely(worst > 1, own, step, frozen(tangents[0]).model, lane))
     return jnp.minimum(far, trusted(*primals)), jnp.zeros_like(far)
 
 
-def _surely(doubted: Bool[Array, ""], step: Sensed, moved: Any, lane: Scalar) -> Scalar:
+def _surely(doubted: Bool[Array, ""], own: Bool[Array, ""], step: Sensed, moved: Any, lane: Scalar) -> Scalar:
     """The length over which no derivative of this mode turns by more than `NEVER_BELOW`. Where terms cancel, as in a
-    mode that is held, derivatives that are zero are rounding, which no step is short enough to resolve. `moved`: the
-    tangent of the model."""
-    dynamic, static = eqx.partition((step.model, step.state, step.t, step.y, moved), eqx.is_array)
+    mode that is held, derivatives that are zero are rounding, which no step is short enough to resolve.
+
+    `doubted`: whether the error of any derivative is too large, `own`: that of this direction, whose tangent of the
+    model is `moved`. (What drives another direction may just pass through zero, where it has no time scale.)
+    """
+    dynamic, static = eqx.partition((step.model, step.state, step.t, step.y, moved, own), eqx.is_array)
     timed = not is_constant(lambda t: step.model.flow(t, step.y, step.state), step.t)
 
     def length(dynamic: Any) -> Scalar:
-        model, state, t, y, moved = eqx.combine(dynamic, static)
+        model, state, t, y, moved, own = eqx.combine(dynamic, static)
         x, unravel = jfu.ravel_pytree(y)
         m = jax.jacfwd(lambda x: jfu.ravel_pytree(model.flow(t, unravel(x), state))[0])(x)
         size, rate = jnp.ones_like(t), jnp.full_like(t, jnp.inf)
@@ -127,7 +131,8 @@ def _surely(doubted: Bool[Array, ""], step: Sensed, moved: Any, lane: Scalar) ->
             m = m / select(norm > 0, norm, 1)
             m = m @ m
         if timed:
-            rate = jnp.maximum(rate, _of_all_directions(_forced_rate(model, moved, state, t, y), lane))
+            forced = select(own, _forced_rate(model, moved, state, t, y), 0)
+            rate = jnp.maximum(rate, _of_all_directions(forced, lane))
         return select(rate > 0, NEVER_BELOW / select(rate > 0, rate, 1), jnp.inf)
 
     none = jnp.zeros_like(step.t)
@@ -153,10 +158,33 @@ def _forced_rate(model: SwitchedSystem, moved: Any, state: ModeState, t: Scalar,
     (value, first), (_, second) = jax.jvp(slope, (t,), (one,))
     size, first, second = (jnp.max(jnp.abs(x)) for x in (value, first, second))
     terms = jnp.max(jnp.abs(tangent(lambda model: model.field(t, y, s))))
+    if model.holdable:
+        terms = jnp.maximum(terms, _by_multipliers(model, moved, state, t, y, s))
     eps = float(jnp.finfo(t.dtype).eps)
     driven = size > 1e5 * eps * terms
     size = select(driven, size, one)
     return select(driven, jnp.maximum(first / size, jnp.sqrt(second / size)), zero)
+
+
+def _by_multipliers(
+    model: SwitchedSystem, moved: Any, state: ModeState, t: Scalar, y: Y, s: tuple[Scalar, ...]
+) -> Scalar:
+    """How large the terms are of which ∂f/∂p consists by way of multipliers, in which they may cancel: as for the unit
+    of a surface, which changes no multiplier."""
+    held = [model.held(k, state.mode[k]) for k in model.holdable]
+    free = put(s, model.holdable, [select(on, 0, s[k]) for k, on in zip(model.holdable, held)])
+
+    def rates(model: SwitchedSystem) -> list[Scalar]:
+        return list(model.rates(model.holdable, t, y, state, free))
+
+    values, changes = eqx.filter_jvp(rates, (model,), (moved,))
+    shares = [
+        jnp.abs(change) * select(on & (value != 0), 1 / select(value == 0, 1, jnp.abs(value)), 0)
+        for value, change, on in zip(values, changes, held)
+        if change is not None
+    ]
+    pull = jax.tree.map(lambda a, b: jnp.max(jnp.abs(a - b)), model.field(t, y, s), model.field(t, y, free))
+    return ft.reduce(jnp.maximum, shares, jnp.zeros_like(t)) * ft.reduce(jnp.maximum, jax.tree.leaves(pull))
 
 
 def _leaves(tree: Any) -> list[Any]:
