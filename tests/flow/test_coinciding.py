@@ -176,8 +176,7 @@ def test_other_methods(solver):
     np.testing.assert_allclose([sol.y1.x, sol.y1.v], flat(want.y1), atol=1e-6)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("where", ["slipping", "sticking"])
+@pytest.mark.parametrize("where", ["slipping", pytest.param("sticking", marks=pytest.mark.slow)])
 def test_derivatives_through_sticking(where):
     """By parameters, strengths and start: those of the one element, and numbers."""
     x, v = STARTS[where]
