@@ -13,7 +13,7 @@ _WITH_RULES = frozenset(("custom_jvp_call", "custom_vjp_call"))
 
 
 class Evaluation(Generic[T]):
-    """The evaluation of a program on values of some kind, by whoever iterates over it.
+    """A program that is evaluated on values of any kind by the loop that iterates over it.
 
     **Arguments:**
 
@@ -21,8 +21,8 @@ class Evaluation(Generic[T]):
     - `values`: what stands for its arguments.
     - `constant`: returns what stands for a constant, of which it is given the number and the type (`aval`).
 
-    It iterates over the operations (equations of the jaxpr), each with what stands for its operands. Before the next
-    one `put` is to be given what stands for the results.
+    The iterator returns each operation (equation of the jaxpr) with the values of its operands. The body of the loop
+    computes the values of the results and passes them to `put`.
     """
 
     def __init__(self, closed: jex.ClosedJaxpr, values: Sequence[T], constant: Callable[[Any, Any], T]) -> None:
@@ -50,8 +50,8 @@ class Evaluation(Generic[T]):
 
 
 def called(equation: Any, with_rules: bool = True) -> jex.ClosedJaxpr | None:
-    """The program of an operation that does nothing but call it, as a function under `jax.jit` does, else None.
-    `with_rules`: functions with derivatives of their own count too."""
+    """Returns the program of an operation that does nothing but call it, as a function under `jax.jit` does; else None.
+    `with_rules`: whether functions with derivatives of their own (`jax.custom_jvp`) count too."""
     name = equation.primitive.name
     if name in _INLINED or (with_rules and name in _WITH_RULES):
         (inner,) = (p for p in equation.params.values() if isinstance(p, jex.ClosedJaxpr))
@@ -74,7 +74,7 @@ def anywhere(jaxpr: jex.Jaxpr, test: Callable[[Any], bool]) -> bool:
     return any(test(equation) or within(equation, test) for equation in jaxpr.eqns)
 
 
-def bound(equation: Any, operands: Sequence[Any]) -> list[Any]:
-    """The results of an operation for these arrays."""
+def applied(equation: Any, operands: Sequence[Any]) -> list[Any]:
+    """Returns the results of an operation for these arrays."""
     out = equation.primitive.bind(*operands, **equation.primitive.get_bind_params(equation.params))
     return list(out) if equation.primitive.multiple_results else [out]

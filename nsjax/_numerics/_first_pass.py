@@ -18,7 +18,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from ._evaluation import bound, called, Evaluation, within
+from ._evaluation import applied, called, Evaluation, within
 from ._inner import scan_counts
 from ._operation import Operation
 
@@ -136,5 +136,5 @@ def _evaluated(closed: jex.ClosedJaxpr, values: Sequence[Any], said: list[Any]) 
             said.append(x[0])
             program.put(e, x[1:])
         else:
-            program.put(e, _called(e, x, said) if within(e, _says) else bound(e, x))
+            program.put(e, _called(e, x, said) if within(e, _says) else applied(e, x))
     return program.results

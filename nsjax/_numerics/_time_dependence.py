@@ -13,7 +13,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
-from ._evaluation import bound, called, Evaluation, has_programs, within
+from ._evaluation import applied, called, Evaluation, has_programs, within
 from ._jaxpr import MOVING
 from ._select import select
 
@@ -197,7 +197,7 @@ class _Reader:
     def _described(self, e: Any, x: list[Any]) -> list[Any]:
         name, count = e.primitive.name, len(e.outvars)
         if all(isinstance(v, Constant) for v in x):
-            return [Constant(v) for v in bound(e, [v.value for v in x])]
+            return [Constant(v) for v in applied(e, [v.value for v in x])]
         inner = called(e)
         if inner is not None:
             return self._call(e, inner, x)
@@ -413,7 +413,7 @@ def _moved(e: Any, x: list[Any]) -> list[Form | None]:
     shapes = [v.aval.shape for v in e.invars]
 
     def moved(part: str) -> list[Any]:
-        return bound(e, [jnp.broadcast_to(getattr(f, part), s) for f, s in zip(forms, shapes)])
+        return applied(e, [jnp.broadcast_to(getattr(f, part), s) for f, s in zip(forms, shapes)])
 
     if name in ("broadcast_in_dim", "reshape", "squeeze") and shapes[0] == e.outvars[0].aval.shape:
         return [first]  # the same arrays, and not some that are equal

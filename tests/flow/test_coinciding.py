@@ -198,6 +198,21 @@ def test_derivatives_through_sticking(where):
     np.testing.assert_allclose(got[:, 8:], 0, atol=1e-6)  # the units of the surfaces
 
 
+def test_the_unit_of_a_surface_costs_no_steps():
+    """Its derivative is zero but for rounding, for which no step must be shortened."""
+    x, v = STARTS["slipping"]
+    p = jnp.asarray([x, v, 1.0, 2.0])
+
+    def end(p):
+        system = Belt(jnp.asarray([1.0, 0.5]), jnp.asarray([1.0, 1.4]), p[2:], a=0.3)
+        sol = solve(system, 0.0, 20.0, start(system, p[0], p[1]), **TIGHT)
+        return sol.y1.x, sol.stats["num_steps"]
+
+    steps = jax.jit(lambda direction: jax.jvp(end, (p,), (direction,))[0][1])
+    by_x, by_v, by_first, by_second = map(steps, jnp.eye(4))
+    assert by_first == by_second == by_x == by_v, (by_x, by_v, by_first, by_second)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("tuples", [(0,), (1,), (0, 1)])
 def test_one_component_of_a_corner(tuples):

@@ -102,25 +102,26 @@ def _trusted_jvp(primals: Any, tangents: Any) -> tuple[Scalar, Scalar]:
     worst = once(ft.reduce(jnp.maximum, jax.tree.leaves(ratios)))  # for each direction, not in one kernel for all
     lane = sum(jnp.sum(x) for x in jax.tree.leaves(step.y))
     worst = select(step.kept & (worst < jnp.inf), worst, 0) / SLACK
-    own, worst = worst > 1, once(_of_all_directions(worst, lane))
+    doubted, worst = worst > 1, once(_of_all_directions(worst, lane))
     # Far below the tolerance the error of one step says little of the next.
     far = select(worst > 0.1, step.length * jnp.maximum(worst, 0.1) ** (-1 / order), jnp.inf)
-    far = jnp.maximum(far, _surely(worst > 1, own, step, frozen(tangents[0]).model, lane))
+    far = jnp.maximum(far, _surely(worst > 1, doubted, step, frozen(tangents[0]).model, lane))
     return jnp.minimum(far, trusted(*primals)), jnp.zeros_like(far)
 
 
-def _surely(doubted: Bool[Array, ""], own: Bool[Array, ""], step: Sensed, moved: Any, lane: Scalar) -> Scalar:
+def _surely(any_doubted: Bool[Array, ""], doubted: Bool[Array, ""], step: Sensed, moved: Any, lane: Scalar) -> Scalar:
     """The length over which no derivative of this mode turns by more than `NEVER_BELOW`. Where terms cancel, as in a
     mode that is held, derivatives that are zero are rounding, which no step is short enough to resolve.
 
-    `doubted`: whether the error of any derivative is too large, `own`: that of this direction, whose tangent of the
-    model is `moved`. (What drives another direction may just pass through zero, where it has no time scale.)
+    `any_doubted`: whether the error is too large in any direction of the derivative; `doubted`: whether it is in this
+    direction, for which the tangent of the model is `moved`. (The forcing ∂f/∂p of a direction whose error is small may
+    pass through zero at this time, where its relative rate of change is infinite.)
     """
-    dynamic, static = eqx.partition((step.model, step.state, step.t, step.y, moved, own), eqx.is_array)
+    dynamic, static = eqx.partition((step.model, step.state, step.t, step.y, moved, doubted), eqx.is_array)
     timed = not is_constant(lambda t: step.model.flow(t, step.y, step.state), step.t)
 
     def length(dynamic: Any) -> Scalar:
-        model, state, t, y, moved, own = eqx.combine(dynamic, static)
+        model, state, t, y, moved, doubted = eqx.combine(dynamic, static)
         x, unravel = jfu.ravel_pytree(y)
         m = jax.jacfwd(lambda x: jfu.ravel_pytree(model.flow(t, unravel(x), state))[0])(x)
         size, rate = jnp.ones_like(t), jnp.full_like(t, jnp.inf)
@@ -131,12 +132,12 @@ def _surely(doubted: Bool[Array, ""], own: Bool[Array, ""], step: Sensed, moved:
             m = m / select(norm > 0, norm, 1)
             m = m @ m
         if timed:
-            forced = select(own, _forced_rate(model, moved, state, t, y), 0)
+            forced = select(doubted, _forced_rate(model, moved, state, t, y), 0)
             rate = jnp.maximum(rate, _of_all_directions(forced, lane))
         return select(rate > 0, NEVER_BELOW / select(rate > 0, rate, 1), jnp.inf)
 
     none = jnp.zeros_like(step.t)
-    return select(doubted, lax.cond(eqxi.unvmap_any(doubted), length, lambda _: none, dynamic), none)
+    return select(any_doubted, lax.cond(eqxi.unvmap_any(any_doubted), length, lambda _: none, dynamic), none)
 
 
 def _forced_rate(model: SwitchedSystem, moved: Any, state: ModeState, t: Scalar, y: Y) -> Scalar:
@@ -169,8 +170,10 @@ def _forced_rate(model: SwitchedSystem, moved: Any, state: ModeState, t: Scalar,
 def _by_multipliers(
     model: SwitchedSystem, moved: Any, state: ModeState, t: Scalar, y: Y, s: tuple[Scalar, ...]
 ) -> Scalar:
-    """How large the terms are of which ∂f/∂p consists by way of multipliers, in which they may cancel: as for the unit
-    of a surface, which changes no multiplier."""
+    """Returns the size of the terms by which a parameter changes the field through the multipliers of held switches.
+
+    These terms may cancel, as they do for the unit of a surface, which changes no multiplier; what is left is rounding.
+    """
     held = [model.held(k, state.mode[k]) for k in model.holdable]
     free = put(s, model.holdable, [select(on, 0, s[k]) for k, on in zip(model.holdable, held)])
 

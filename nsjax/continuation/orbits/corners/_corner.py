@@ -78,10 +78,10 @@ def corner_at(tracer: OrbitTracer, name: str, zero: Zero, most: int) -> Node | N
         return _end(tracer, name, zero)
     mapped, points = found_map
     arrived = tuple(int(kinds[t.row] == "duration" or bounces) for t in touches)
-    acts = mapped.corner.e.any()
-    if not acts and held_beyond(curve, zero.point, zero.side):
+    has_effect = mapped.corner.e.any()
+    if not has_effect and held_beyond(curve, zero.point, zero.side):
         return _end(tracer, name, zero)
-    cycles = cycles_of(mapped, most) if acts else _through(mapped.corner, zero.side, arrived)
+    cycles = cycles_of(mapped, most) if has_effect else _through(mapped.corner, zero.side, arrived)
     halves = [
         half for cycle in cycles.cycles if (half := half_of(tracer, spot, mapped.corner, points, cycle)) is not None
     ]
