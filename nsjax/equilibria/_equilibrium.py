@@ -141,8 +141,10 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, newton: Newton
     z, converged = find_root(residual, (x0, sigma), system, newton, sizes=sizes, isolated=False)
     end = jfu.ravel_pytree(frozen(z))[0]
     error, matrix = frozen((flat(end), jax.jacfwd(flat)(end)))
-    sizes = sizes_near(matrix, jnp.maximum(jnp.abs(start), jnp.abs(end)))
     rows, columns = equilibrated(matrix)
+    # Every step leaves its rounding in all unknowns; what is no larger than that is no size.
+    rounding = 10 * jnp.finfo(t.dtype).eps * columns * jnp.max(jnp.abs(end - start) / columns)
+    sizes = sizes_near(matrix, jnp.maximum(jnp.abs(start), select(jnp.abs(end) > rounding, jnp.abs(end), 0)))
     left, singular, right = svd(rows[:, None] * matrix * columns)
     isolated = singular[-1] > 1e-10 * singular[0]
     # Among large numbers rounding keeps Newton's method from ending. (The steps are the shortest ones here, too.)

@@ -69,3 +69,15 @@ def test_distinct_equilibria(unit):
     starts = {"x": unit * jnp.linspace(-1.3, 1.3, 14), "v": jnp.zeros(14)}
     places = nsjax.find_equilibria(Valley(unit), starts)
     assert np.allclose(sorted(float(place.y["x"]) / unit for place in places), [-1, 0, 1], atol=1e-9)
+
+
+@pytest.mark.parametrize("omega", [2.5298221281347035, 2.6])
+def test_a_guess_within_rounding_of_an_equilibrium_at_zero(omega):
+    """Neither the guess nor what Newton's method leaves of it is a size: all that the equations add to it is rounding."""
+    scene = gallery.thesis("A.7", omega=omega, coordinates="cartesian")
+    random = np.random.default_rng(1)
+    guesses = 10 ** random.uniform(-15, -3, (200, 1)) * random.uniform(-1, 1, (200, 4))
+    unravel = jfu.ravel_pytree(scene.state())[1]
+    places = jax.vmap(lambda x: nsjax.find_equilibrium(scene, unravel(x), throw=False))(guesses)
+    assert np.all(places.result == nsjax.RESULTS.successful) and np.all(places.admissible)
+    assert np.all(np.abs(jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(places.y)) < 1e-20)
