@@ -58,7 +58,7 @@ def size():
 
 
 def pytest_addoption(parser):
-    parser.addoption("--part", metavar="K/N", help="run the K-th of N parts of the selected tests; -m slow --part 3/8")
+    parser.addoption("--part", metavar="K/N", help="run the K-th of N parts of the selected tests; -m slow --part 3/24")
 
 
 def pytest_collection_modifyitems(config, items):

@@ -17,8 +17,11 @@ def single(tree):
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("key", gallery.THESIS)
+def slow_but(quick):
+    return [key if key == quick else pytest.param(key, marks=pytest.mark.slow) for key in gallery.THESIS]
+
+
+@pytest.mark.parametrize("key", slow_but("5.7"))  # with an event that is nearly tangential
 def test_gallery_in_single_precision(key):
     """Pitfalls 1, 3: every system has the same events as in double precision, none twice, and nothing falls through."""
     entry = gallery.THESIS[key]

@@ -96,7 +96,8 @@ def transition(
     turns = event.found & news & ~halted & (bends > 0)
     depth = (met.rate[slot] * lax.stop_gradient(length)) ** 2 / (2 * select(turns, bends, 1))
     rtol = jnp.asarray(0.0 if stepper.exact else tolerance[0], t.dtype)  # NaN for steps of a given length
-    error = jnp.maximum(select(rtol >= 0, rtol, 0), 1e4 * float(jnp.finfo(t.dtype).eps))
+    # Rounding is allowed a hundred units in the last place, which in single precision is what the tolerance is.
+    error = jnp.maximum(select(rtol >= 0, rtol, 0), 1e2 * float(jnp.finfo(t.dtype).eps))
     grazes = turns & (depth < 10 * error * jnp.maximum(largest(polynomial), met.size[slot]))
     points = None
     if record is not None:
