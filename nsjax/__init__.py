@@ -72,4 +72,11 @@ from .maps import (
 from .orbits import find_orbit as find_orbit, find_orbits as find_orbits, Orbit as Orbit, Segment as Segment
 from .regularise import banded as banded, mark_kinks as mark_kinks, smoothed as smoothed
 from .sweeps import Sweep as Sweep, sweep as sweep
-from .system import clock as clock, impact as impact, relay as relay, sgn as sgn, System as System
+from .system import (
+    clock as clock,
+    impact as impact,
+    LevelSwitch as LevelSwitch,
+    relay as relay,
+    sgn as sgn,
+    System as System,
+)

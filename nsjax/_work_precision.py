@@ -24,7 +24,6 @@ from .orbits._find_orbit import find_orbit
 from .orbits._orbit import Orbit
 from .regularise._regularise import banded, smoothed
 from .system._checks import check_system
-from .system._sgn import sgn
 from .system._switch import AbstractSwitch, forwarded
 from .system._system import SwitchValues, System
 
@@ -111,7 +110,7 @@ def methods_for(system: System) -> dict[str, Method]:
         "events, Dopri8": Method(dfx.Dopri8()),
         "events, Taylor": Method(Taylor()),
     }
-    frictions = [k for k in system.switches if isinstance(k, sgn) and not k.jumps]
+    frictions = [k for k in system.switches if k.signed and not k.jumps]
     if frictions:
         if all(k.bound(system) == 1 for k in frictions):
             found["arctan, ε = 1e4"] = Method(dfx.Kvaerno5(), lambda s: smoothed(s, 1e4))

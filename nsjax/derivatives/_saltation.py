@@ -52,11 +52,11 @@ def after_event(model: SwitchedSystem, k: int, t: Scalar, y: Y, state: ModeState
     if not model.switches[k].jumps:
         return y, none
     if k in model.clocks:  # its reset sees functions of time as they are after the tick
-        ticked = model.switches[k].next_mode(state.mode[k], model.direction)
+        ticked = model.next_mode(k, t, y, state.mode[k])
         model = model.within(put(state.mode, (k,), (ticked,)))
     gap = Gap.of(model, k)
     bounced, _ = rebound(gap, t, y, state)
-    if not isinstance(model.switches[k], impact):
+    if not model.switches[k].unilateral:
         return bounced, none
     # (Between two ticks: a segment that follows may be the first of the next period.)
     after = tuple(state.mode[j] if j in model.clocks else m for j, m in enumerate(after))
@@ -106,7 +106,7 @@ def _jump(model: SwitchedSystem, t: Scalar, y: Y, k: int, before: tuple, after: 
 
     (r_t, dr), (rest_t, drest) = jax.jacfwd(hit, argnums=(0, 1))(t, flat)
     x, rest = hit(t, flat)
-    if isinstance(model.switches[k], impact):
+    if model.switches[k].unilateral:
         rests = (before[k] == 0) & (after[k] == 1)
         onto = select(rests, jax.jacfwd(lambda x: ravel(_held(model, t + rest, unravel(x), after)))(x), onto)
     later = model.state_at(t, unravel(x), after)
@@ -153,7 +153,7 @@ def _matrix(
     terms = j.dr, -jnp.outer(j.f_after, j.drest), select(none, 0, turn / select(none, 1, speed))
     size = sum(map(jnp.abs, terms), jnp.zeros_like(turn))
     jump = _unless_rounding(sum(terms, jnp.zeros_like(turn)), _part(size))
-    if not isinstance(model.switches[k], impact):
+    if not model.switches[k].unilateral:
         return jump, tangential
     finite = jnp.all(jnp.isfinite(jump))  # else zeros of the projection would make NaN of what is infinite
     projected = _unless_rounding(j.onto @ select(finite, jump, 0), _part(jnp.abs(j.onto) @ select(finite, size, 0)))

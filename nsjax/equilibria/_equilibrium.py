@@ -21,10 +21,9 @@ from .._types import Scalar, StateT, Y
 from ..derivatives._floquet import eigenvalues
 from ..flow._results import outcomes, RESULTS
 from ..orbits._orbit import ravel
-from ..system._impact import impact
+from ..system._level_switch import LevelSwitch
 from ..system._mode import mode_words, ModeState, OFF
 from ..system._model import SwitchedSystem
-from ..system._relay import relay
 from ..system._system import System
 
 
@@ -239,8 +238,8 @@ def _place(
     size, forces = unravel(sizes[: len(x)]), dict(zip(model.holdable, sizes[len(x) :]))
     for k, switch in enumerate(model.switches):
         mode = state.mode[k]
-        if isinstance(switch, relay):
-            admissible = admissible & (switch.rising(model.system, t, y, mode) <= 0)
+        if isinstance(switch, LevelSwitch):
+            admissible = admissible & (switch.margin(model.system, t, y, mode) >= 0)
             continue
 
         def surface(t: Scalar, y: Y, k: int = k) -> tuple[Scalar, ...]:
@@ -252,7 +251,7 @@ def _place(
         if model.conditional(k):
             absent, off = model.absent(k, state.mode), mode == OFF
             h, on = select(off, select(absent, 1, -1), select(absent, -1, h)), on & ~off
-        side = (h >= -slack) if isinstance(switch, impact) else (mode.astype(h.dtype) * h >= -slack)
+        side = (h >= -slack) if switch.unilateral else (mode.astype(h.dtype) * h >= -slack)
         if k not in model.holdable:
             admissible, boundary = admissible & side, boundary | on
             continue

@@ -17,10 +17,7 @@ from .._types import StateT, Y
 from ..flow._arguments import checked_start
 from ..flow._results import raise_if, RESULTS
 from ..orbits._orbit import ravel
-from ..system._clock import clock
-from ..system._impact import impact
 from ..system._model import SwitchedSystem
-from ..system._sgn import sgn
 from ..system._system import arrays_of, System
 from ._equilibrium import Equilibrium, equilibrium_in
 
@@ -119,7 +116,7 @@ def checked_equilibrium(system: System, y0: Y, t: Any, mode: Any, tol: float | N
     t, y0, given = checked_start(system, t, y0, mode)
     system = arrays_of(system, t.dtype)
     values = system.values(tuple(jnp.zeros((), t.dtype) for _ in system.switches))
-    ticks = any(isinstance(switch, clock) for switch in system.switches)
+    ticks = any(switch.ticking for switch in system.switches)
     if ticks or not is_constant(lambda t: system.vector_field(t, y0, values), t):
         raise ValueError(
             f"`{type(system).__name__}` has no equilibrium, because time enters its vector field: look for a periodic "
@@ -132,10 +129,10 @@ def _options(model: SwitchedSystem, given: dict[str, Any]) -> list[tuple[int, ..
     """The modes that each switch may have."""
     options = []
     for k, switch in enumerate(model.switches):
-        free = (-1, 1) if isinstance(switch, sgn) else (0, 1)
-        if isinstance(switch, sgn) and k in model.holdable:
-            free = (-1, 0, 1)
-        elif isinstance(switch, impact) and k not in model.contacts:
+        free = switch.modes
+        if switch.signed:
+            free = (-1, 0, 1) if k in model.holdable else (-1, 1)
+        elif switch.unilateral and k not in model.contacts:
             free = (0,)
         options.append((int(given[switch.name]),) if switch.name in given else free)
     return options
@@ -153,11 +150,13 @@ def _mode_of(model: SwitchedSystem, t: Any, y: Y) -> list[Any]:
     """By the signs of h; what lies on a surface that can hold it counts as held."""
     modes = []
     for k, switch in enumerate(model.switches):
-        if isinstance(switch, sgn):
+        if switch.signed:
             h = model.least(k, t, y)
             noise = jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y))
             on = 0 if k in model.holdable else 1
             modes.append(select(jnp.abs(h) <= noise, on, jnp.sign(h)).astype(jnp.int32))
+        elif switch.levels:
+            modes.append(model.level_at(k, t, y, jnp.asarray(switch.modes[0], jnp.int32)))
         else:
             modes.append(jnp.zeros((), jnp.int32))
     return modes

@@ -14,10 +14,8 @@ from .._numerics._select import select
 from .._numerics._text import components, counted, written
 from .._types import Y
 from ..system._checks import closing_contacts, forces_on_speeds
-from ..system._impact import impact
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
-from ..system._sgn import sgn
 from ._results import RESULTS
 from ._solution import Solution
 
@@ -136,7 +134,7 @@ def _fired(sol: Solution) -> str:
 def _timed(system: Any, sol: Solution) -> str | None:
     """An impact with a reset whose gap does not depend on the state."""
     for switch in system.switches:
-        if isinstance(switch, (impact, sgn)) and switch.reset_fn is not None:
+        if switch.jumps and not switch.ticking:
             gaps = jax.jacfwd(lambda y: switch.components(system, sol.t1, y))(sol.y1)
             if not any(np.any(leaf) for leaf in jax.tree.leaves(gaps)):
                 return switch.name

@@ -21,7 +21,6 @@ from ..flow._results import is_okay, outcomes, raise_if, RESULTS
 from ..flow._solution import Solution
 from ..flow.events._initial_mode import start_mode
 from ..system._checks import check_model
-from ..system._impact import impact
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
 from ..system._system import arrays_of, System
@@ -150,7 +149,7 @@ class PoincareMap(eqx.Module):
 
 def _named(model: SwitchedSystem) -> tuple[bool, ...]:
     """An impact that cannot be rested upon has one mode only, of which `solve` wants to hear nothing."""
-    return tuple(k in model.contacts or not isinstance(s, impact) for k, s in enumerate(model.switches))
+    return tuple(k in model.contacts or not s.unilateral for k, s in enumerate(model.switches))
 
 
 @interactive

@@ -6,11 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from ..system._clock import clock
-from ..system._impact import impact
-from ..system._relay import relay
-from ..system._sgn import sgn
-from ..system._switch import AbstractSwitch
 from ..system._system import System
 
 
@@ -23,7 +18,7 @@ Rows = Int[np.ndarray, "events switches+1"]
 
 def mode_row(system: System, mode: Int[Array, " more"]) -> Int[Array, " switches"]:
     """Without those that a section adds. Of a clock all ticks are alike: it never comes back to a mode."""
-    still = [0 if isinstance(s, clock) else 1 for s in system.switches]
+    still = [0 if s.ticking else 1 for s in system.switches]
     return mode[: len(still)].astype(jnp.int8) * jnp.asarray(still, jnp.int8)
 
 
@@ -65,7 +60,7 @@ def _accumulated(system: System, rows: Rows) -> Rows:
     """Impacts that lead to rest are infinitely many, of which as many were made as the tolerance wants: one stands for
     all of them."""
     before = np.roll(rows, 1, axis=0)
-    resting = [isinstance(s, impact) for s in system.switches]
+    resting = [s.unilateral for s in system.switches]
     keep, n = np.ones(len(rows), bool), len(rows)
     for i, row in enumerate(rows):
         k = row[0]
@@ -82,15 +77,15 @@ def itinerary_words(system: System, rows: Rows) -> str:
     """As they are printed: `belt0 belt+ belt-`, `(belt0 belt-)×2 belt+`."""
     switches = system.switches
     if rows[0, 0] < 0:
-        words = ", ".join(filter(None, (_mode_word(s, int(m)) for s, m in zip(switches, rows[0, 1:]))))
+        words = ", ".join(filter(None, (s.symbol(int(m)) for s, m in zip(switches, rows[0, 1:]))))
         return f"no event: {words}" if words else "no event"
     words = []
     for before, row, after in zip(np.roll(rows, 1, axis=0), rows, np.roll(rows, -1, axis=0)):
         k = int(row[0])
         others = (j for j in range(len(switches)) if j != k and row[1 + j] != before[1 + j])
-        word = _event_word(switches[k], int(before[1 + k]), int(row[1 + k]))
-        word = ",".join([word, *(_event_word(switches[j], int(before[1 + j]), int(row[1 + j])) for j in others)])
-        at_rest = isinstance(switches[k], impact) and before[1 + k] == row[1 + k] == 0
+        word = switches[k].event_symbol(int(before[1 + k]), int(row[1 + k]))
+        word = ",".join([word, *(switches[j].event_symbol(int(before[1 + j]), int(row[1 + j])) for j in others)])
+        at_rest = switches[k].unilateral and before[1 + k] == row[1 + k] == 0
         words.append(word + "×∞" * bool(at_rest and after[0] == k and after[1 + k] == 1))
     return _shortened(words)
 
@@ -110,18 +105,3 @@ def _shortened(words: list[str]) -> str:
         out.append(part if times == 1 else f"({part})×{times}" if best > 1 else f"{part}×{times}")
         i += best * times
     return " ".join(out)
-
-
-def _event_word(switch: AbstractSwitch, before: int, after: int) -> str:
-    """What happens: for a contact that is not rested upon the impact itself."""
-    if isinstance(switch, impact):
-        return f"{switch.name}:rests" if after else f"{switch.name}:leaves" if before else switch.name
-    return _mode_word(switch, after) or switch.name
-
-
-def _mode_word(switch: AbstractSwitch, mode: int) -> str:
-    if isinstance(switch, sgn):
-        return f"{switch.name}{('0', '+', ':off', '-')[mode]}"
-    if isinstance(switch, relay):
-        return f"{switch.name}:{'on' if mode else 'off'}"
-    return f"{switch.name}:rests" if isinstance(switch, impact) and mode else ""

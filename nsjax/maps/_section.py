@@ -20,8 +20,6 @@ from ..flow._results import is_okay, RESULTS
 from ..flow._solution import Solution
 from ..flow._solve import integrate
 from ..flow.events._initial_mode import AT_ONCE
-from ..system._clock import clock
-from ..system._impact import impact
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
 from ..system._sgn import sgn
@@ -118,7 +116,7 @@ class _Section(PoincareMap):
         late = is_okay(sol.result) & ~(sol.t1 < end)
         y1 = sol.y1
         for switch in system.switches:
-            if isinstance(switch, impact) and switch.ends:
+            if switch.unilateral and switch.ends:
                 y1 = _onto(switch, system, sol, y1)
         return sol.t1, y1, RESULTS.where(late, RESULTS.no_return, sol.result), sol
 
@@ -155,12 +153,12 @@ def section_map(
                 f"Argument `section` must be a function of (t, y), or the name of a switch of `{owner}` ({known}), but "
                 f"got {section!r}."
             )
-        if isinstance(found, clock):
+        if found.ticking:
             raise ValueError(
                 f"Argument `section` must not be the clock `{section}`, which ticks by itself: take "
                 "`nsjax.stroboscopic_map`."
             )
-        if isinstance(found, impact) and direction == -1:
+        if found.unilateral and direction == -1:
             raise ValueError(
                 f"Argument `direction` must be 1 or 0 for the impact `{section}`, because an iterate is the state "
                 "after it, but got -1."

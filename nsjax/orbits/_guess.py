@@ -16,10 +16,7 @@ from ..flow._integrator import Integrator
 from ..flow._results import is_okay
 from ..flow._solution import Solution
 from ..flow._solve import integrate
-from ..system._clock import clock
 from ..system._model import SwitchedSystem
-from ..system._relay import relay
-from ..system._sgn import sgn
 from ..system._system import System
 from ._orbit import distance, ravel
 
@@ -51,7 +48,7 @@ def base_on(sol: Solution, t0: Scalar, y0: Y, period: Scalar, sign: float) -> tu
     begin, end, _, modes = arcs(sol, t0, y0)
     begin, end = (jnp.minimum(sign * (t - t0), period) for t in (begin, end))
     slides = jnp.stack(
-        [modes[:, k] == 0 for k, s in enumerate(system.switches) if isinstance(s, sgn)] or [jnp.zeros(len(begin), bool)]
+        [modes[:, k] == 0 for k, s in enumerate(system.switches) if s.signed] or [jnp.zeros(len(begin), bool)]
     ).any(0)
     longest = jnp.argmax((end - begin) * select(slides, 1e-6, 1.0))
     base = t0 + sign * 0.5 * (begin[longest] + end[longest])
@@ -69,7 +66,7 @@ def base_on(sol: Solution, t0: Scalar, y0: Y, period: Scalar, sign: float) -> tu
 
 def of_relays(system: System, mode: Any) -> Relays:
     """Of a mode of all switches that of the relays, as an argument for `solve`."""
-    return {k.name: mode[i] for i, k in enumerate(system.switches) if isinstance(k, relay)} or None
+    return {k.name: mode[i] for i, k in enumerate(system.switches) if k.levels} or None
 
 
 @interactive
@@ -80,10 +77,13 @@ def relays_at(system: System, t0: Scalar, y0: Y, given: Relays) -> Relays:
 
 @interactive
 def undecided(system: System, t0: Scalar, y0: Y) -> dict[str, Bool[Array, ""]]:
-    """Which relays are within their hysteresis."""
-    relays = [k for k in system.switches if isinstance(k, relay)]
-    surfaces = {k.name: k.surfaces(system, t0, y0) for k in relays}
-    return {name: (on <= 0) & (off <= 0) for name, (on, off) in surfaces.items()}
+    """Which switches with levels may have several modes at a state, as a relay has within its hysteresis."""
+    unsure, model = {}, SwitchedSystem.forwards(system, t0, y0)
+    for k in model.which("levels"):
+        switch = model.switches[k]
+        modes = jnp.stack([model.level_at(k, t0, y0, jnp.asarray(before, jnp.int32)) for before in switch.modes])
+        unsure[switch.name] = jnp.any(modes != modes[0])
+    return unsure
 
 
 def at_start(model: SwitchedSystem, t: Scalar, y: Y, given: Relays = None) -> Any:
@@ -92,14 +92,14 @@ def at_start(model: SwitchedSystem, t: Scalar, y: Y, given: Relays = None) -> An
     modes = []
     for k, switch in enumerate(model.switches):
         zero = jnp.zeros((), jnp.int32)
-        if isinstance(switch, sgn):
+        if switch.signed:
             h = model.least(k, t, y)
             noise = jnp.max(model.rounding(lambda t, y, k=k: model.h(k, t, y), t, y))
             zero = select(jnp.abs(h) <= 1e3 * noise, 0, jnp.sign(h)).astype(jnp.int32)
-        elif isinstance(switch, relay):
-            before = jnp.asarray((given or {}).get(switch.name, zero), jnp.int32)
-            zero = switch.mode_at(model.system, t, y, before)
-        elif isinstance(switch, clock):
+        elif switch.levels:
+            before = jnp.asarray((given or {}).get(switch.name, switch.modes[0]), jnp.int32)
+            zero = model.level_at(k, t, y, before)
+        elif switch.ticking:
             zero = model.counts(t)[k]
         modes.append(zero)
     return model.state_at(t, y, tuple(modes))

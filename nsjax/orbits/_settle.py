@@ -26,7 +26,6 @@ from ..flow._results import is_okay, RESULTS
 from ..flow._solution import Solution
 from ..flow._solve import integrate
 from ..system._model import SwitchedSystem
-from ..system._sgn import sgn
 from ..system._system import System
 from ._guess import at_start, of_relays, Relays
 from ._orbit import distance, ravel
@@ -201,7 +200,7 @@ def sticks_anywhere(system: System, t0: Scalar, y: Y) -> Bool[Array, ""]:
     size = jnp.max(jnp.abs(matrix))
     sticks = jnp.zeros((), bool)
     for k, switch in enumerate(model.switches):
-        if isinstance(switch, sgn):
+        if switch.signed:
             held = state.mode[k] == 0
             sticks = sticks | held
             for i in range(model.parts[k]):
@@ -217,5 +216,5 @@ def held_throughout(system: System, begin: Array, end: Array, modes: Array) -> B
     """Whether friction holds a solution along all of its arcs. (At the edge of the continuum it lets go for a time
     of the size of the root of rounding.)"""
     length = jnp.maximum(end - begin, 0)
-    free = [jnp.sum(select(modes[:, i] == 0, 0, length)) for i, k in enumerate(system.switches) if isinstance(k, sgn)]
+    free = [jnp.sum(select(modes[:, i] == 0, 0, length)) for i, k in enumerate(system.switches) if k.signed]
     return jnp.any(jnp.asarray(free, length.dtype) <= 1e-3 * jnp.sum(length))

@@ -25,7 +25,6 @@ from ..flow._results import is_okay, RESULTS
 from ..flow._solution import Events, Solution
 from ..flow._solve import integrate
 from ..system._model import SwitchedSystem
-from ..system._relay import relay
 from ..system._system import System
 from ._guess import at_start, base_on, base_point, LAPS, relays_at
 from ._orbit import distance, fractions, judge, Orbit, ravel
@@ -254,8 +253,8 @@ def _described(
     system, t0, integrator, (later, monodromy) = sol.system, sol.t0, shooting.integrator, along
     model, x, autonomous = SwitchedSystem.forwards(system, t0, y0), ravel(y0), system.period is None
     error, smallest = distance(ravel(sol.y1), x), shooting.integrator.smallest_size(x.dtype)
-    # A relay has a memory: its mode must come back with the state.
-    closes = jnp.all(jnp.asarray([sol.mode0[k] == sol.mode1[k] for k in model.of_kind(relay)], bool))
+    # A switch with levels may have a memory: its mode must come back with the state.
+    closes = jnp.all(jnp.asarray([sol.mode0[k] == sol.mode1[k] for k in model.which("levels")], bool))
     near = error <= 1e3 * shooting.newton.tol * (smallest + jnp.max(jnp.abs(x)))
     result = judge(converged & near & is_okay(sol.result) & closes, x, later, autonomous, shooting.order, smallest)
     if section is not None:

@@ -1,5 +1,6 @@
 """The phase plane: trajectories with the surfaces they meet, and Poincaré sections."""
 
+import itertools
 from typing import Any, TYPE_CHECKING
 
 import jax
@@ -12,10 +13,6 @@ from .._numerics._text import components
 from .._types import Y
 from ..flow._solution import Solution
 from ..orbits._orbit import Orbit
-from ..system._clock import clock
-from ..system._impact import impact
-from ..system._relay import relay
-from ..system._sgn import sgn
 from ..system._switch import AbstractSwitch
 from ._path import arcs, chosen, solved
 from ._style import axes_or_new, axis_label, declared, EVENT, JUMP, Labels, legend as add_legend, mode_line, once
@@ -25,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 DASHES = (0, (4, 1.5))  # in widths of the line
+STYLES = ("--", ":", "-.")  # of the surfaces of one switch
 GRID = 201  # points along each axis on which the indicator functions are drawn
 
 
@@ -104,39 +102,32 @@ def _draw_surfaces(ax: "Axes", sol: Solution, x: str, y: str) -> None:
     plane = jnp.asarray(plane, flat.dtype).reshape(-1, 2)
     drawn = np.concatenate([np.asarray(line.get_xydata())[::4] for line in ax.get_lines()])
     for switch in sol.system.switches:
-        for guard, style in _guards(switch):
-            if not is_constant(lambda t, g=guard: g(sol.system, t, sol.y1), sol.t0):
+        surfaces = jax.jit(jax.vmap(lambda point, k=switch: k.drawn(sol.system, sol.t0, unravel(point))))(plane)
+        labels = list(switch.drawn(sol.system, sol.t0, sol.y1))  # in their order, which transformations do not keep
+        for label, style in zip(labels, itertools.cycle(STYLES)):
+            if not is_constant(lambda t, k=switch, label=label: k.drawn(sol.system, t, sol.y1)[label], sol.t0):
                 continue
-            h = jax.jit(jax.vmap(lambda point, g=guard: g(sol.system, sol.t0, unravel(point))))(plane)
-            h = np.asarray(h).reshape(GRID, GRID)
+            h = np.asarray(surfaces[label]).reshape(GRID, GRID)
             if h.min() < 0 < h.max():
-                _draw_surface(ax, switch, along[0], along[1], h, style, drawn)
+                _draw_surface(ax, switch, label, (along[0], along[1], h), style, drawn)
     ax.set_xlim(xlim)
     ax.set_ylim(ylim)
 
 
-def _guards(switch: AbstractSwitch) -> list[tuple[Any, str]]:
-    """Indicator functions with the line style of their surfaces: where a relay switches on, and off."""
-    if isinstance(switch, clock):
-        return []
-    if isinstance(switch, relay):
-        return [(switch.guard, "--"), (switch.off_guard, ":")]
-    return [(lambda *args: jnp.stack(switch.components(*args)).min(), "--")]
-
-
 def _draw_surface(
-    ax: "Axes", switch: AbstractSwitch, x: np.ndarray, y: np.ndarray, h: np.ndarray, style: str, drawn: np.ndarray
+    ax: "Axes", switch: AbstractSwitch, label: str, field: tuple[np.ndarray, ...], style: str, drawn: np.ndarray
 ) -> None:
+    """Draws the zeros of h, with what `switch` says of their two sides. `field`: x, y, and h on their grid."""
+    x, y, h = field
     line = dict(colors="0.35", linestyles=style, linewidths=1.0)
     contour = ax.contour(x, y, h, levels=[0.0], zorder=1, **line)
-    name = switch.name if not isinstance(switch, relay) else f"{switch.name} {'on' if style == '--' else 'off'}"
-    ax.plot([], [], color="0.35", linestyle=style, linewidth=1.0, label=once(ax, f"{name}: h = 0"))
-    if isinstance(switch, sgn):
+    ax.plot([], [], color="0.35", linestyle=style, linewidth=1.0, label=once(ax, label))
+    if switch.signed:
         ax.contourf(x, y, h, levels=[h.min() - 1, 0.0], colors=["0.5"], alpha=0.12, zorder=0)
-    elif isinstance(switch, impact):
+    elif switch.unilateral:
         filled = ax.contourf(x, y, h, levels=[h.min() - 1, 0.0], colors=["none"], hatches=["////"], zorder=0)
         filled.set_edgecolor("0.8")
-    if not isinstance(switch, relay):
+    if not switch.levels:
         vertices = np.concatenate([p.vertices for p in contour.get_paths()])
         _draw_signs(ax, vertices, x, y, h, drawn)
 

@@ -5,7 +5,7 @@ Both are rules for the values `s` of the `sgn` switches as functions of time and
 
 import abc
 import functools as ft
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import equinox as eqx
@@ -23,7 +23,6 @@ from .._types import Scalar, Y
 from ..system._checks import check_model, check_system
 from ..system._mode import ModeState
 from ..system._model import SwitchedSystem
-from ..system._sgn import sgn
 from ..system._switch import AbstractSwitch, forwarded
 from ..system._system import arrays_of, SwitchValues, System
 
@@ -40,7 +39,7 @@ _Values = SwitchValues | Mapping[str, Any]
 
 
 @ft.cache
-def _pulled(switch: sgn) -> sgn:
+def _pulled(switch: AbstractSwitch) -> AbstractSwitch:
     """The switch with the indicator function h exp(rate (t - now)). What keeps it constant makes dh/dt = -rate h."""
 
     def guard(self: "_Pulled", t: Scalar, y: Y) -> tuple[Scalar, ...]:
@@ -50,32 +49,37 @@ def _pulled(switch: sgn) -> sgn:
     return forwarded(switch)._with(guard=guard)
 
 
-def _slides(switch: AbstractSwitch) -> bool:
-    """Whether the switch is a sign that is replaced. One whose events reset the state remains."""
-    return isinstance(switch, sgn) and not switch.jumps
+def _sliding(system: System) -> tuple[AbstractSwitch, ...]:
+    """The switches on whose surfaces a solution may slide: signs, apart from those whose events reset the state."""
+    return tuple(k for k in system.switches if k.signed and not k.jumps)
 
 
 def _height(switch: AbstractSwitch, system: System, t: Scalar, y: Y) -> Scalar:
     return ft.reduce(jnp.minimum, switch.components(system, t, y))
 
 
-def _field(system: System, t: Scalar, y: Y, friction: _Values, others: _Values) -> Y:
-    """The vector field of `system` with the values of its `sgn` switches from one place, of the others from another."""
-    values = [(friction if _slides(k) else others)[k.name] for k in system.switches]
-    return system.vector_field(t, y, system.values(tuple(values)))
+def _field(system: System, t: Scalar, y: Y, replaced: Sequence[AbstractSwitch], values: _Values, others: _Values) -> Y:
+    """The vector field of `system`, with `values` of the switches that are `replaced`, and those of the `others`."""
+    both = [(values if k in replaced else others)[k.name] for k in system.switches]
+    return system.vector_field(t, y, system.values(tuple(both)))
 
 
 class _Regularised(System):
-    """A system whose `sgn` switches have values that are functions of time and state. Its other switches remain."""
+    """A system some of whose switches have values that are functions of time and state. The others remain."""
 
     system: eqx.AbstractVar[System]
 
+    @property
+    @abc.abstractmethod
+    def replaced(self) -> tuple[AbstractSwitch, ...]:
+        """The switches that have such values."""
+
     @abc.abstractmethod
     def put(self, t: Scalar, y: Y, s: SwitchValues) -> _Values:
-        """The values of the `sgn` switches, for the values `s` of the others."""
+        """The values of the switches that are replaced, for the values `s` of the others."""
 
     def vector_field(self, t: Scalar, y: Y, s: SwitchValues) -> Y:
-        return _field(self.system, t, y, self.put(t, y, s), s)
+        return _field(self.system, t, y, self.replaced, self.put(t, y, s), s)
 
     @property
     def jumps_in_time(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -83,7 +87,7 @@ class _Regularised(System):
 
     @property
     def switches(self) -> tuple[AbstractSwitch, ...]:
-        return tuple(forwarded(k) for k in self.system.switches if not _slides(k))
+        return tuple(forwarded(k) for k in self.system.switches if k not in self.replaced)
 
     @property
     def period(self) -> Float[Array, ""] | float | None:
@@ -98,9 +102,15 @@ class Smoothed(_Regularised):
     kind: str = eqx.field(static=True)
     offset: dict[str, Float[Array, ""] | float] = eqx.field(default_factory=dict)
 
+    @property
+    def replaced(self) -> tuple[AbstractSwitch, ...]:
+        return tuple(k for k in self.system.switches if k.smooths)
+
     def put(self, t: Scalar, y: Y, s: SwitchValues) -> dict[str, Any]:
-        frictions = [k for k in self.system.switches if _slides(k)]
-        return {k.name: _CURVES[self.kind](self.eps * _height(k, self.system, t, y)) for k in frictions}
+        def sign(h: Scalar) -> Scalar:
+            return _CURVES[self.kind](self.eps * h)
+
+        return {k.name: k.smoothed_value(self.system, t, y, sign) for k in self.replaced}
 
     def vector_field(self, t: Scalar, y: Y, s: SwitchValues) -> Y:
         f = super().vector_field(t, y, s)
@@ -124,7 +134,7 @@ class Smoothed(_Regularised):
                 """∂f/∂s, for the values of the other switches that are here."""
 
                 def field(value: Scalar) -> Y:
-                    return _field(*place(*x), friction | {k.name: value}, s)
+                    return _field(*place(*x), self.replaced, friction | {k.name: value}, s)
 
                 value = friction[k.name]
                 return jax.tree.leaves(jax.jvp(field, (value,), (jnp.ones_like(value),))[1])
@@ -207,11 +217,11 @@ class _Pulled(System):
     now: Scalar
 
     def vector_field(self, t: Scalar, y: Y, s: SwitchValues) -> Y:
-        return _field(self.system, t, y, s, self.others)
+        return _field(self.system, t, y, _sliding(self.system), s, self.others)
 
     @property
     def switches(self) -> tuple[AbstractSwitch, ...]:
-        return tuple(_pulled(k) for k in self.system.switches if _slides(k))
+        return tuple(map(_pulled, _sliding(self.system)))
 
 
 class Banded(_Regularised):
@@ -220,6 +230,10 @@ class Banded(_Regularised):
     system: System
     eta: Float[Array, ""] | float
     rate: Float[Array, ""] | float
+
+    @property
+    def replaced(self) -> tuple[AbstractSwitch, ...]:
+        return _sliding(self.system)
 
     @property
     def jumps_in_time(self) -> str:  # multipliers are compared with their bounds
@@ -289,17 +303,14 @@ def _positive(name: str, value: Any) -> Any:
     return value
 
 
-def _frictions(system: Any) -> list[sgn]:
-    """The `sgn` switches of a system, of which there must be one."""
-    check_system(system)
-    found = [k for k in system.switches if _slides(k)]
-    if not found:
+def _check_replaced(system: System, replaced: Sequence[AbstractSwitch]) -> None:
+    """Raises if there is no switch to be replaced."""
+    if not replaced:
         others = ", ".join(f"`{k.name}`" for k in system.switches)
         raise ValueError(
             f"Argument `system` must have a `sgn` switch to be regularised, but `{type(system).__name__}` has "
             f"{f'only {others}' if others else 'no switch'}. Pass it to `solve` as it is."
         )
-    return found
 
 
 def smoothed(
@@ -309,6 +320,7 @@ def smoothed(
     offset: Mapping[str, Any] | None = None,
 ) -> System:
     """The smoothing method, Leine (2000), section 2.4: the value of every `sgn` switch is a steep function of its h.
+    (So is that of a `LevelSwitch` which has a `smoothed_value`.)
 
         "arctan"    s = (2/π) arctan(ε h)       eq. (2.32)
         "tanh"      s = tanh(ε h)
@@ -346,7 +358,9 @@ def smoothed(
     runtime error if that shows only when numbers are there; or if the field is found to jump on a surface with an
     offset, where it is evaluated within |h| <= 1/ε. `TypeError`, there, for an operation without a Taylor series.
     """
-    frictions = _frictions(system)
+    check_system(system)
+    frictions = _sliding(system)
+    _check_replaced(system, [k for k in system.switches if k.smooths])
     if kind not in _CURVES:
         known = ", ".join(map(repr, _CURVES))
         raise ValueError(f"Argument `kind` must be one of {known}, but got {kind!r}.")
@@ -411,5 +425,6 @@ def banded(system: System, eta: Any, rate: Any = 1.0) -> System:
     **Raises:** `ValueError` for an `eta` or `rate` that is not positive, and for a system without a `sgn` switch. A
     runtime error if that shows only when numbers are there.
     """
-    _frictions(system)
+    check_system(system)
+    _check_replaced(system, _sliding(system))
     return Banded(system, _positive("eta", eta), _positive("rate", rate))

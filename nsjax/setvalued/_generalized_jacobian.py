@@ -14,7 +14,6 @@ from .._types import Y
 from ..flow._arguments import checked_start
 from ..system._model import SwitchedSystem
 from ..system._parameter import get_parameter, parameter_path, put_parameter
-from ..system._sgn import sgn
 from ..system._system import arrays_of, System
 
 
@@ -86,7 +85,7 @@ def generalized_jacobian(
     flat, unravel = jfu.ravel_pytree(y)
     values, on = [], []
     for k, switch in enumerate(model.switches):
-        if not isinstance(switch, sgn):
+        if not switch.signed:
             values.append(jnp.asarray(given.get(switch.name, 0), t.dtype))
             continue
         h = model.least(k, t, y)

@@ -2,6 +2,7 @@
 
 from ._clock import clock as clock
 from ._impact import impact as impact
+from ._level_switch import LevelSwitch as LevelSwitch
 from ._relay import relay as relay
 from ._sgn import sgn as sgn
 from ._system import System as System

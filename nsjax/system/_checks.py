@@ -16,7 +16,6 @@ from .._numerics._select import select
 from .._numerics._text import did_you_mean, outline
 from .._types import Scalar, Y
 from ._clock import clock
-from ._impact import impact
 from ._mode import ModeState, put
 from ._model import SwitchedSystem
 from ._switch import AbstractSwitch
@@ -207,8 +206,8 @@ def forces_on_speeds(model: SwitchedSystem, t: Scalar, y: Y) -> dict[int, Bool[A
     on dh/dt. Then no impulse changes dh/dt by a finite amount."""
     zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
     found = {}
-    for k in model.of_kind(impact):
-        if k in model.contacts or getattr(model.switches[k], "reset_fn", None) is not None:
+    for k in model.which("unilateral"):
+        if k in model.contacts or model.switches[k].resets:
             continue
 
         def rates(value: Scalar, k: int = k) -> tuple[Scalar, ...]:

@@ -50,6 +50,7 @@ class clock(ResettingSwitch):
     - `name`: needed only when the switch is made outside a class body.
     """
 
+    ticking = True
     offset_fn: Callable[[Any], Any] | None = None
     derived: ClassVar[bool] = False  # whether it was not declared but found in the program of a model
 
@@ -67,8 +68,12 @@ class clock(ResettingSwitch):
     def surfaces(self, system: "System", t: Scalar, y: Y) -> tuple[Scalar, ...]:
         return ()
 
-    def next_mode(self, mode: Int[Array, ""], direction: Any) -> Int[Array, ""]:
-        return mode + select(direction > 0, 1, -1)
+    def drawn(self, system: "System", t: Scalar, y: Y) -> dict[str, Scalar]:
+        return {}
+
+    def ticked(self, count: Int[Array, ""], direction: Any) -> Int[Array, ""]:
+        """Its mode after a tick, in time that runs forwards (`direction` > 0) or backwards."""
+        return count + select(direction > 0, 1, -1)
 
     def surface(self, model: "SwitchedSystem", k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
         return model.span(k, state.mode)[1] - t

@@ -1,7 +1,7 @@
 """The time of a model with clocks: at a tick, functions of time are taken from the side on which the mode is."""
 
 import functools as ft
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,8 +9,9 @@ from jaxtyping import Array, Bool, Int
 
 from .._numerics._autodiff import frozen
 from .._numerics._select import select
-from .._types import Mode, Scalar
+from .._types import Mode, Scalar, Y
 from ._clock import clock
+from ._level_switch import LevelSwitch
 from ._mode import ModeState
 from ._switch import AbstractSwitch
 from ._system import System
@@ -30,16 +31,16 @@ class Clocked(eqx.Module):
         self.direction = direction
         self.window = None
         self.switches = system.switches
-        self.clocks = self.of_kind(clock)
+        self.clocks = self.which("ticking")
 
     @property
     def jumping(self) -> tuple[int, ...]:
         """The switches whose events change the state."""
         return tuple(k for k, switch in enumerate(self.switches) if switch.jumps)
 
-    def of_kind(self, kind: type[AbstractSwitch]) -> tuple[int, ...]:
-        """Which switches are of a kind."""
-        return tuple(k for k, switch in enumerate(self.switches) if isinstance(switch, kind))
+    def which(self, what: Literal["signed", "unilateral", "ticking", "levels"]) -> tuple[int, ...]:
+        """The switches whose modes say this, see `AbstractSwitch`."""
+        return tuple(k for k, switch in enumerate(self.switches) if getattr(switch, what))
 
     @property
     def declared(self) -> int:
@@ -65,6 +66,21 @@ class Clocked(eqx.Module):
         """The same for what sets out at time `t`."""
         zero, counts = jnp.zeros((), jnp.int32), self.counts(t)
         return self.within(tuple(counts.get(k, zero) for k in range(len(self.switches))))
+
+    def next_mode(self, k: int, t: Scalar, y: Y, mode: Int[Array, ""]) -> Int[Array, ""]:
+        """The mode of a switch after its event, as far as that follows from the mode before: of clocks, and of those
+        whose modes are levels."""
+        switch = self.switches[k]
+        if isinstance(switch, clock):
+            return switch.ticked(mode, self.direction)
+        assert isinstance(switch, LevelSwitch)
+        return switch.next_mode(self.system, self.time(t), y, mode)
+
+    def level_at(self, k: int, t: Scalar, y: Y, before: Int[Array, ""]) -> Int[Array, ""]:
+        """The mode of a switch whose modes are levels, at a state that is reached in the mode `before`."""
+        switch = self.switches[k]
+        assert isinstance(switch, LevelSwitch)
+        return switch.mode_at(self.system, self.time(t), y, before)
 
     def _in(self, state: ModeState) -> Self:
         return self if self.window is not None else self.within(state.mode)

@@ -42,6 +42,7 @@ class impact(ResettingSwitch):
     modes = (0, 1)
     order = 2
     holding = 1
+    unilateral = True
     restitution_fn: Callable[[Any], Any] | None = None
 
     if TYPE_CHECKING:
@@ -56,6 +57,10 @@ class impact(ResettingSwitch):
     def jumps(self) -> bool:
         return True
 
+    def coefficient(self, system: "System") -> Any:
+        assert self.restitution_fn is not None
+        return self.restitution_fn(system)
+
     def value(self, mode: Int[Array, ""], dtype: Any) -> Scalar:
         return jnp.zeros((), dtype)  # the contact force of a flight
 
@@ -64,6 +69,12 @@ class impact(ResettingSwitch):
 
     def words(self, mode: int) -> str:
         return f"{self.name}: rests" if mode else ""
+
+    def symbol(self, mode: int) -> str:
+        return f"{self.name}:rests" if mode else ""
+
+    def event_symbol(self, before: int, after: int) -> str:
+        return f"{self.name}:rests" if after else f"{self.name}:leaves" if before else self.name
 
     def guard_row(self, model: "SwitchedSystem", slot: Slot, t: Scalar, y: Y, state: ModeState) -> list[Scalar]:
         k = slot.switch

@@ -8,16 +8,14 @@ from jaxtyping import Array, Int
 
 from .._numerics._select import select
 from .._types import Guard, Scalar, Y
-from ._mode import ModeState, Slot
-from ._switch import AbstractSwitch
+from ._level_switch import LevelSwitch
 
 
 if TYPE_CHECKING:
-    from ._model import SwitchedSystem
     from ._system import System
 
 
-class relay(AbstractSwitch):
+class relay(LevelSwitch):
     """A switch with memory: its value is 0 or 1, with a surface of its own for each change.
 
     Both surfaces are levels and not edges: a relay that is on while its `off` indicator function is above zero switches
@@ -48,17 +46,15 @@ class relay(AbstractSwitch):
     def surfaces(self, system: "System", t: Scalar, y: Y) -> tuple[Scalar, ...]:
         return self.guard(system, t, y), self.off_guard(system, t, y)
 
-    def rising(self, system: "System", t: Scalar, y: Y, mode: Int[Array, ""]) -> Scalar:
-        """The indicator function that makes it leave its mode where it rises through zero."""
+    def margin(self, system: "System", t: Scalar, y: Y, mode: Int[Array, ""]) -> Scalar:
         on, off = self.surfaces(system, t, y)
-        return select(mode == 1, off, on)
+        return -select(mode == 1, off, on)
 
     def mode_at(self, system: "System", t: Scalar, y: Y, before: Any) -> Int[Array, ""]:
-        """Its mode at a state, which within the hysteresis is the one that it had `before`."""
         on, off = (h > 0 for h in self.surfaces(system, t, y))
         return select(on & ~off, 1, select(off, 0, before)).astype(jnp.int32)
 
-    def next_mode(self, mode: Int[Array, ""], direction: Any) -> Int[Array, ""]:
+    def next_mode(self, system: "System", t: Scalar, y: Y, mode: Int[Array, ""]) -> Int[Array, ""]:
         return 1 - mode
 
     def modes_after(self, direction: int) -> tuple[int, ...]:
@@ -67,11 +63,12 @@ class relay(AbstractSwitch):
     def words(self, mode: int) -> str:
         return f"{self.name} {'on' if mode else 'off'}"
 
-    def surface(self, model: "SwitchedSystem", k: int, t: Scalar, y: Y, state: ModeState) -> Scalar:
-        return self.rising(model.system, model.time(t), y, state.mode[k])
+    def symbol(self, mode: int) -> str:
+        return f"{self.name}:{'on' if mode else 'off'}"
 
-    def guard_row(self, model: "SwitchedSystem", slot: Slot, t: Scalar, y: Y, state: ModeState) -> list[Scalar]:
-        return [-self.rising(model.system, model.time(t), y, state.mode[slot.switch])]
+    def drawn(self, system: "System", t: Scalar, y: Y) -> dict[str, Scalar]:
+        on, off = self.surfaces(system, t, y)
+        return {f"{self.name} on: h = 0": on, f"{self.name} off: h = 0": off}
 
     def check(self, system: "System", t: Scalar, y: Y, along: Callable[[Scalar], Y]) -> None:
         owner = type(system).__name__

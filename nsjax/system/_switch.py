@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, ClassVar, Self, TYPE_CHECKING
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from .._numerics._jaxpr import never_negative
@@ -32,6 +33,11 @@ class AbstractSwitch(abc.ABC):
     modes: ClassVar[tuple[int, ...]] = ()  # those that a user may name, in the order of the colours of their lines
     order: ClassVar[int] = 0  # which derivative of h its value can keep at zero, and so hold the solution; 0: none
     holding: ClassVar[int] = 0  # the mode in which it does so
+    # What its mode says; of these only one is true.
+    signed: ClassVar[bool] = False  # on which side of its surface the state is, by the sign of h; 0 where it is held
+    unilateral: ClassVar[bool] = False  # whether the contact that keeps h >= 0 is closed
+    ticking: ClassVar[bool] = False  # how many of its events, which happen at given times, have passed
+    levels: ClassVar[bool] = False  # which of several levels the state has passed, see `LevelSwitch`
 
     guard: Guard
     name: str
@@ -74,6 +80,15 @@ class AbstractSwitch(abc.ABC):
         """Whether its events change the state."""
         return False
 
+    @property
+    def resets(self) -> bool:
+        """Whether it does so by a function of the user's, and not by a law of impact."""
+        return False
+
+    def coefficient(self, system: "System") -> Any:
+        """Newton's coefficient of restitution, of its law of impact."""
+        raise NotImplementedError(f"`{type(self).__name__}` has no law of impact.")
+
     def value(self, mode: Int[Array, ""], dtype: Any) -> Scalar:
         """What `vector_field` is given for it in a mode, unless it holds the solution."""
         return mode.astype(dtype)
@@ -91,17 +106,34 @@ class AbstractSwitch(abc.ABC):
         """Whether it is a contact that is closed in this mode."""
         return mode == 1
 
-    def next_mode(self, mode: Int[Array, ""], direction: Any) -> Int[Array, ""]:
-        """Its mode after it has fired, as far as the mode before determines it."""
-        return mode
-
     def modes_after(self, direction: int) -> tuple[int, ...]:
         """The modes to which its event leads where h rises (`direction` 1), falls (-1), or either (0)."""
         return self.modes
 
+    @property
+    def smooths(self) -> bool:
+        """Whether a regularised system has a smooth function in its place, see `smoothed_value`."""
+        return False
+
+    def smoothed_value(self, system: "System", t: Scalar, y: Y, sign: Callable[[Scalar], Scalar]) -> Scalar:
+        """Returns its value in a regularised system, in which `sign` is the smooth function that replaces a sign."""
+        raise NotImplementedError(f"`{type(self).__name__}` has no smooth value.")
+
     def words(self, mode: int) -> str:
         """The mode as a legend names it, if it needs to be named."""
         return ""
+
+    def symbol(self, mode: int) -> str:
+        """The mode in the words of an itinerary, as `belt+`; empty if it goes without saying."""
+        return ""
+
+    def event_symbol(self, before: int, after: int) -> str:
+        """What happens at an event, in the words of an itinerary."""
+        return self.symbol(after) or self.name
+
+    def drawn(self, system: "System", t: Scalar, y: Y) -> dict[str, Scalar]:
+        """The functions whose zeros are its surfaces in a phase plane, by their labels."""
+        return {f"{self.name}: h = 0": ft.reduce(jnp.minimum, self.components(system, t, y))}
 
     # Its guards, positive while the mode lasts, as `SwitchedSystem.guards` puts them together.
 
@@ -168,6 +200,10 @@ class ResettingSwitch(AbstractSwitch):
 
     @property
     def jumps(self) -> bool:
+        return self.resets
+
+    @property
+    def resets(self) -> bool:
         return self.reset_fn is not None
 
     def _check_sign(self, system: "System", t: Scalar, y: Y) -> None:

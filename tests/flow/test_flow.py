@@ -1,5 +1,7 @@
 """Trajectories against closed forms and 40-digit references."""
 
+from typing import Any
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -268,6 +270,48 @@ def test_relay_without_hysteresis_is_told():
     assert sol.result == RESULTS.stuck_in_events
     with pytest.raises(nsjax.SolveError, match=r"where these fired: \d+ heater\.\)"):
         solve(chatters, 0.0, 10.0, Heat(16.0), **how)
+
+
+class Stiffened(nsjax.System):
+    """An oscillator that is stiffer beyond x = 0.3, without a jump of its force; by a relay whose two levels are the
+    same, which is crossed and does not chatter."""
+
+    w: Any
+
+    def vector_field(self, t, y, s):
+        return y[1], self.w**2 * (-y[0] - 0.5 * s.beyond * (y[0] - 0.3))
+
+    @nsjax.relay
+    def beyond(self, t, y):
+        return y[0] - 0.3
+
+    @beyond.off
+    def beyond(self, t, y):
+        return 0.3 - y[0]
+
+
+@pytest.mark.parametrize("map_lanes", [nsjax.sweep, lambda fn, w: jax.jit(jax.vmap(fn))(w)])
+def test_relay_whose_levels_are_the_same_is_crossed(map_lanes):
+    """At late times the state on its surface has the rounding of the time. Energy is conserved, and both parts of a
+    period are known: at x = 0.3 the speed is v, the rest of the way a quarter of a harmonic motion and what is before."""
+
+    def end(w):
+        sol = solve(Stiffened(w), 0.0, 200.0, (0.0, 2 * w), max_steps=2**14, throw=False)
+        return sol.result, sol.events.num, sol.y1
+
+    w = np.linspace(0.5, 3.0, 20)
+    result, number, (x, v) = map_lanes(end, jnp.asarray(w))
+    assert np.all(np.asarray(result == RESULTS.successful))
+    # Around its middle at x = 0.1 the stiffer oscillator has the frequency sqrt(1.5) w.
+    fast, speed = np.sqrt(1.5) * w, np.sqrt(4 - 0.3**2) * w
+    begin = np.arcsin(0.15) / w
+    beyond = 2 / fast * np.arctan2(speed, fast * 0.2)
+    period = np.pi / w + 2 * begin + beyond
+    laps = np.floor((200.0 - begin) / period)
+    rest = 200.0 - begin - laps * period
+    np.testing.assert_array_equal(number, 2 * laps + 1 + (rest > beyond))
+    energy = v**2 / 2 + w**2 * (x**2 / 2 + 0.25 * np.maximum(x - 0.3, 0) ** 2)
+    np.testing.assert_allclose(energy, 2 * w**2, rtol=1e-5)
 
 
 # Section 2.1: fields are constant on both sides, for which one step of Euler's method is exact.

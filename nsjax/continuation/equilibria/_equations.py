@@ -23,11 +23,10 @@ from ...equilibria._equilibrium import (
     stacked_values,
     switch_values,
 )
+from ...system._level_switch import LevelSwitch
 from ...system._mode import ModeState, OFF
 from ...system._model import SwitchedSystem
 from ...system._parameter import put_parameter
-from ...system._relay import relay
-from ...system._sgn import sgn
 
 
 KINK = 1e-7  # what a switch does at its surface, relative to what it does elsewhere, where the field is continuous
@@ -98,15 +97,15 @@ class EquilibriumCurve(eqx.Module):
         return Record(y, value, stacked_values(values, x.dtype), roots, held, all_decay(roots, held) & attracts)
 
     # Guards, switch by switch: the components of h, and their minimum if there are several; of one that can hold what
-    # is left to the bounds of its value, and to ±1 if it holds beyond. Of a relay both surfaces.
+    # is left to the bounds of its value, and to ±1 if it holds beyond. Of one with levels its margin in each mode.
 
     def guards(self, u: Array) -> Array:
         """Functions at whose zeros the mode may change."""
         model, y, sigma = self.at(u)
         rows: list[Any] = []
         for k, switch in enumerate(model.switches):
-            if isinstance(switch, relay):
-                rows += switch.surfaces(model.system, self.t, y)
+            if isinstance(switch, LevelSwitch):
+                rows += [switch.margin(model.system, self.t, y, jnp.asarray(m, jnp.int32)) for m in switch.modes]
                 continue
             h = model.h(k, self.t, y)
             rows += [*h, model.least(k, self.t, y)] if len(h) > 1 else h
@@ -121,11 +120,11 @@ class EquilibriumCurve(eqx.Module):
         return jnp.stack([jnp.asarray(row, u.dtype) for row in rows]) if rows else jnp.zeros(0, u.dtype)
 
     def slots(self) -> list[tuple[int, str, int]]:
-        """Of each guard its switch, what it is ("h", "least", "value", "one", "relay"), and which."""
+        """Of each guard its switch, what it is ("h", "least", "value", "one", "level"), and which."""
         slots = []
         for k, switch in enumerate(self.model.switches):
-            if isinstance(switch, relay):
-                slots += [(k, "relay", 0), (k, "relay", 1)]
+            if switch.levels:
+                slots += [(k, "level", m) for m in switch.modes]
                 continue
             number = self.model.parts[k]
             slots += [(k, "h", i) for i in range(number)] + [(k, "least", 0)] * (number > 1)
@@ -143,8 +142,8 @@ class EquilibriumCurve(eqx.Module):
             m, part = mode[:, k]
             number = self.model.parts[k]
             held = k in self.model.holdable and self.model.held(k, m)
-            if what == "relay":
-                signs.append(-1 if i == m else 0)
+            if what == "level":
+                signs.append(int(i == m))
             elif m == OFF and self.model.conditional(k):
                 signs.append(0)
             elif what == "h" and held:
@@ -159,7 +158,7 @@ class EquilibriumCurve(eqx.Module):
 
     def modes_at(self, u: Array, mode: np.ndarray, active: np.ndarray) -> tuple[list[np.ndarray], list[str], bool]:
         """The modes that may meet where the guards `active` vanish; the switches these are of; and whether the field is
-        continuous there. There are none where a relay switches."""
+        continuous there. There are none where a level is passed."""
         touched = sorted({k for (k, _, _), on in zip(self.slots(), active) if on})
         smooth = np.asarray(kinks(self, u))
         options, continuous = [], True
@@ -169,11 +168,11 @@ class EquilibriumCurve(eqx.Module):
                 back = now[0] == OFF and self.model.conditional(k) and self.model.contact[k] in touched
                 options.append([(int(_side(self, u, k)), now[1])] if back else [now])
                 continue
-            if isinstance(switch, relay):
+            if switch.levels:
                 return [], [switch.name], False
             parts = [i for (j, what, i), on in zip(self.slots(), active) if on and j == k and what == "h"]
             parts = parts if parts and self.model.parts[k] > 1 else [now[1]]
-            if isinstance(switch, sgn):
+            if switch.signed:
                 free = [(-1, now[1]), (1, now[1])]
                 holds = k in self.model.holdable and not smooth[k]
                 options.append(free + [(0, part) for part in parts] * holds)

@@ -15,7 +15,6 @@ from ..._numerics._select import select
 from ..._types import Y
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
-from ...system._sgn import sgn
 from .._loop import Carry
 from .._save import Log, Saved
 from ._arc import Rows
@@ -121,7 +120,7 @@ def entered(problem: Problem, table: Table, c: Carry, wait: Lanes) -> Lane:
 
 def strange(problem: Problem, modes: tuple[Numbers, ...], also: Truths) -> Truths:
     """Where a mode is none of those with a table, as it holds what is only crossed here; and `also` others."""
-    own = [k for k in problem.plan.crossed if isinstance(problem.model.switches[k], sgn)]
+    own = [k for k in problem.plan.crossed if problem.model.switches[k].signed]
     return ft.reduce(jnp.logical_or, [modes[k] == 0 for k in own], also)
 
 

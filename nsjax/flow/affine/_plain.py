@@ -11,8 +11,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..._numerics._autodiff import frozen
 from ..._numerics._select import select
-from ...system._impact import impact
-from ...system._relay import relay
 from ._arc import dot, Rows
 from ._plan import Problem
 
@@ -64,9 +62,9 @@ def plain(problem: Problem, m: Meeting) -> Plain:
     for k, switch in enumerate(model.switches):
         rows = plan.of(k)
         now = ft.reduce(jnp.logical_or, [m.fires[r] for r in rows])
-        if isinstance(switch, impact):
+        if switch.unilateral:
             new = _rebound(problem, m, k)
-        elif isinstance(switch, relay):
+        elif switch.levels:
             new = _change(problem, m, k)
         elif k in plan.crossed:
             new = _crossing(problem, m, k)

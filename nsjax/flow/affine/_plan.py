@@ -14,11 +14,9 @@ from ..._numerics._jaxpr import dependence, is_constant
 from ..._numerics._select import select
 from ..._numerics._time_dependence import Forcing, forcing, time_dependence
 from ..._types import Scalar, Y
-from ...system._impact import impact
 from ...system._mode import ModeState, put, Slot
 from ...system._model import SwitchedSystem
 from ...system._relay import relay
-from ...system._sgn import sgn
 from .._loop import Flow
 from ..steppers._exponential import affine_parts
 
@@ -94,16 +92,18 @@ def planned(
     """
     if not isinstance(meter, dfx.NoProgressMeter) or len(model.switches) > MOST_SWITCHES:
         return None
-    kinds = (sgn, impact, relay)
-    if any(s.condition or not isinstance(s, kinds) or (isinstance(s, sgn) and s.jumps) for s in model.switches):
+    # Of switches with levels the exact flow knows relays only, whose two levels it writes as rows.
+    if any(s.condition or s.ticking or (s.levels and not isinstance(s, relay)) for s in model.switches):
+        return None
+    if any(s.signed and s.jumps for s in model.switches):
         return None
     zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
     crossed = tuple(k for k in range(len(zeros)) if not _simple(model, k, t, y) and _let_through(model, k, t, y))
     if crossed:
         model = SwitchedSystem(model.system, model.direction, t, y, crossed=crossed)
     for k, switch in enumerate(model.switches):
-        newton = isinstance(switch, impact) and switch.restitution_fn is not None and k in model.contacts
-        if k not in crossed and not (_simple(model, k, t, y) and (isinstance(switch, sgn) or newton)):
+        newton = k in model.contacts and not switch.resets
+        if k not in crossed and not (_simple(model, k, t, y) and (switch.signed or newton)):
             return None
     if not (model.steady and model.jointly_affine):
         return None
@@ -128,7 +128,7 @@ def _simple(model: SwitchedSystem, k: int, t: Scalar, y: Y) -> bool:
     """Whether a switch may hold the solution: it has one h, and to do with no other, and acts always in one way."""
     zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
     steady = is_constant(lambda at: pull(model, k, at[2], at[0], at[1]), (t, y, zeros))
-    return model.parts[k] == 1 and model.apart[k] and steady and not isinstance(model.switches[k], relay)
+    return model.parts[k] == 1 and model.apart[k] and steady and not model.switches[k].levels
 
 
 def _let_through(model: SwitchedSystem, k: int, t: Scalar, y: Y) -> bool:
@@ -136,11 +136,11 @@ def _let_through(model: SwitchedSystem, k: int, t: Scalar, y: Y) -> bool:
     its h is a function of, as the force of a stop that vanishes where it lets go. (Friction under a load that varies is
     not. Whether it vanishes is asked at each event.)"""
     switch, zeros = model.switches[k], tuple(jnp.zeros_like(t) for _ in model.switches)
-    if isinstance(switch, impact) or (switch.static and k in model.holdable):
+    if switch.unilateral or (switch.static and k in model.holdable):
         return False
     if not is_constant(lambda s: pull(model, k, s, t, y), zeros):
         return False
-    if isinstance(switch, relay):
+    if switch.levels:
         return True
     x, unravel = jfu.ravel_pytree(y)
 
@@ -206,7 +206,7 @@ def of_mode(model: SwitchedSystem, plan: Plan, y: Y, state: ModeState) -> Callab
         guards = dict(zip(model.slots, model.guards(t, y, state))) if model.slots else {}
         values = []
         for k, free, held in plan.rows:
-            if free is not None and k in plan.crossed and isinstance(model.switches[k], sgn):
+            if free is not None and k in plan.crossed and model.switches[k].signed:
                 values.append(state.mode[k].astype(t.dtype) * model.h(k, t, y)[free.part])
             elif free and held:
                 values.append(select(model.held(k, state.mode[k]), guards[held][0], guards[free][0]))
@@ -250,13 +250,13 @@ def constants(model: SwitchedSystem, plan: Plan, t: Scalar, y: Y) -> Constants:
 
             level[k] = columns(rate, plan, t)[0]
             gain[k] = level[k][: plan.size] @ push[k]
-            restitution[k] = jnp.asarray(model.switches[k].restitution_fn(model.system), t.dtype)  # type: ignore
+            restitution[k] = jnp.asarray(model.switches[k].coefficient(model.system), t.dtype)
         else:
             gain[k] = jax.jvp(lambda x, k=k: model.h(k, t, unravel(x))[0], (still,), (push[k],))[1]
             bound[k] = jnp.asarray(model.bound(k), t.dtype)
     pulls, levels = {}, {}
     for k in plan.crossed:
-        if isinstance(model.switches[k], relay):
+        if model.switches[k].levels:
             levels[k] = columns(lambda t, x, k=k: jnp.stack(surfaces(model, k, t, unravel(x))), plan, t)
         else:
             pulls[k] = columns(lambda t, x, k=k: _flat(pull(model, k, zeros, t, unravel(x))), plan, t)
@@ -285,6 +285,6 @@ def numbers(model: SwitchedSystem) -> int:
     """How many modes there are."""
     count = 1
     for k, switch in enumerate(model.switches):
-        free = 1 if isinstance(switch, impact) else 2
+        free = 1 if switch.unilateral else 2
         count *= free + (k in model.holdable)
     return count

@@ -14,7 +14,6 @@ from ..._numerics._jaxpr import is_constant
 from ..._numerics._linalg import linear_solve
 from ..._numerics._select import select
 from ..._types import Scalar, Y
-from ...system._impact import impact
 from ...system._mode import ModeState, OFF, pick, put
 from ...system._model import SwitchedSystem
 from ...system._switch import ResettingSwitch
@@ -45,7 +44,7 @@ class Gap(eqx.Module):
     @property
     def closes(self) -> bool:
         """Whether the switch keeps h >= 0, as an impact does; a surface that is crossed does not."""
-        return isinstance(self.switch, impact)
+        return self.switch.unilateral
 
     def chosen(self, numbers: Sequence[Any]) -> Any:
         """Selects from `numbers`, one for each switch, that of the switch which has fired."""
@@ -92,9 +91,7 @@ def rebound(gap: Gap, t: Scalar, y: Y, state: ModeState) -> tuple[Y, Y]:
         return out, jax.tree.map(lambda a, b: jnp.abs(a) + jnp.abs(b), y, out)
     fired, factors = dict(zip(gap.which, gap.fired)), []
     for k in gap.which:
-        law = model.switches[k]
-        assert isinstance(law, impact) and law.restitution_fn is not None
-        factors.append(jnp.asarray(law.restitution_fn(model.system), t.dtype))
+        factors.append(jnp.asarray(model.switches[k].coefficient(model.system), t.dtype))
     e = gap.chosen(factors)
     e = select(model.direction > 0, e, 1 / e)
     k, can_rest = gap.which[0], gap.which[0] in model.contacts

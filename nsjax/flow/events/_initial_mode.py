@@ -9,11 +9,8 @@ from ..._numerics._autodiff import frozen
 from ..._numerics._linalg import nearly
 from ..._numerics._select import select
 from ..._types import Scalar, Y
-from ...system._impact import impact
 from ...system._mode import ModeState, OFF, put
 from ...system._model import SwitchedSystem
-from ...system._relay import relay
-from ...system._sgn import sgn
 from .._results import RESULTS
 from ._mode_choice import settle
 
@@ -32,10 +29,10 @@ def start_mode(
     for k, switch in enumerate(model.switches):
         if k in counts:  # whatever `mode` says: it may be that of the same phase a period earlier
             start.put(counts[k])
-        elif isinstance(switch, relay):
-            before = jnp.asarray(given.get(switch.name, 0), jnp.int32)
-            start.put(switch.mode_at(model.system, model.time(t), y, before))
-        elif isinstance(switch, impact):
+        elif switch.levels:
+            before = jnp.asarray(given.get(switch.name, switch.modes[0]), jnp.int32)
+            start.put(model.level_at(k, t, y, before))
+        elif switch.unilateral:
             start.put_contact(k)
         else:
             start.put_sign(k)
@@ -124,7 +121,7 @@ class _Start:
         """A start so near to a surface that an event there could not be told from the start is on it: the end of a
         period on the surface is off by rounding."""
         model, t, y, state = self.model, self.t, self.y, self.state()
-        free = [k for k in model.of_kind(sgn) if k not in self.chosen]
+        free = [k for k in model.which("signed") if k not in self.chosen]
         f = model.flow(t, y, state) if free else None
         for k in free:
             instant = 2 * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + self.horizon)
@@ -144,7 +141,7 @@ class _Start:
             if model.conditional(k):
                 off = off & ~model.absent(k, state.mode)
             self.result = RESULTS.where(off, RESULTS.wrong_mode, self.result)
-            if isinstance(model.switches[k], impact):
+            if model.switches[k].unilateral:
                 below = off & (model.least(k, t, y) < 0)
                 self.result = RESULTS.where(below, RESULTS.start_penetrates, self.result)
 
@@ -178,7 +175,7 @@ class _Start:
                 roots[k] = select((state.mode[k] == 0) & ((k in self.chosen) | ~self.at[k]), edge, roots[k])
         for k, here in self.on.items():
             rate = model.approach(k, t, y, state, f)
-            sign = 1 - state.mode[k] if isinstance(model.switches[k], impact) else state.mode[k]
+            sign = 1 - state.mode[k] if model.switches[k].unilateral else state.mode[k]
             part = 0 if state.part[k] is None else state.part[k]
             size = model.sizes(lambda t, y, k=k: model.h(k, t, y), t, y, jnp.ones_like(t), f)[part]
             fresh = select(jnp.abs(rate) > jnp.sqrt(jnp.finfo(t.dtype).eps) * size, 1, 2)

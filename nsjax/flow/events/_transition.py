@@ -13,12 +13,8 @@ from ..._numerics._autodiff import frozen
 from ..._numerics._bernstein import bend, largest
 from ..._numerics._select import select
 from ..._types import Scalar, Y
-from ...system._clock import clock
-from ...system._impact import impact
 from ...system._mode import ModeState, OFF
 from ...system._model import SwitchedSystem
-from ...system._relay import relay
-from ...system._sgn import sgn
 from .._results import RESULTS
 from ..steppers._stepper import stack, Stepper
 from ._impact import completed, Gap, rebound
@@ -64,16 +60,16 @@ def transition(
     contested = event.is_contested()
     later = event.later = model.within(tuple(event.modes))  # after a tick what depends on time is another function
     for k, switch in enumerate(model.switches):
-        if isinstance(switch, sgn):
+        if switch.signed:
             event.meet(k)
-        elif isinstance(switch, impact):
+        elif switch.unilateral:
             event.open_at_tick(k)
     event.come_to_rest()
     state, forked = event.choose()
     after, t, t_after, halted = event.after, event.t, event.t_after, event.halted
     if model.contacts:
         after = later.project(t_after, after, state)
-    state = event.relays_on_their_surfaces(state, after)
+    state = event.levels_just_passed(state, after)
     news = jnp.zeros((), bool)
     for k, switch in enumerate(model.switches[: model.declared]):
         news = news | (state.mode[k] != step.state.mode[k])
@@ -177,16 +173,16 @@ class _Event:
             self.fired[k] = self.fired[k] | now
             if self.parts[k] is not None:
                 mode = self.state.mode[k]
-                if isinstance(self.model.switches[k], sgn):
+                if self.model.switches[k].signed:
                     self.tip[k] = self.tip[k] | (now & (mode == 0))
                 self.parts[k] = select(now, select(mode < 0, component, number), self.parts[k])
 
     def jump(self) -> None:
-        """The modes of relays and clocks, and the states after impacts."""
+        """The modes of clocks and of switches with levels, and the states after impacts."""
         model, t, before, modes = self.model, self.t, self.before, self.modes
         for k, switch in enumerate(model.switches):
-            if isinstance(switch, (relay, clock)):
-                modes[k] = select(self.fired[k], switch.next_mode(modes[k], model.direction), modes[k])
+            if switch.levels or switch.ticking:
+                modes[k] = select(self.fired[k], model.next_mode(k, t, before, modes[k]), modes[k])
         touching = self.state._replace(part=tuple(self.parts))
         for which in self.jumping():
             # A reset by a clock sees functions of time as they are after the tick.
@@ -213,8 +209,7 @@ class _Event:
         model = self.model
 
         def alike(k: int) -> bool:
-            switch = model.switches[k]
-            return k in model.contacts and isinstance(switch, impact) and switch.reset_fn is None
+            return k in model.contacts and not model.switches[k].resets
 
         group = tuple(filter(alike, model.jumping))
         return ([group] if group else []) + [(k,) for k in model.jumping if k not in group]
@@ -226,7 +221,7 @@ class _Event:
         """Whether an impact changes the speed at which another contact, met at the same instant, closes: which of the
         two rebounds first then decides the outcome, and only the order of declaration says so."""
         model, t, contested = self.model, self.t, jnp.zeros((), bool)
-        impacts = tuple(model.of_kind(impact))
+        impacts = model.which("unilateral")
         if len(impacts) < 2:
             return contested
         before, after = frozen((self.before, self.after))
@@ -304,7 +299,7 @@ class _Event:
             self.result = RESULTS.where(fired & end.wrong, RESULTS.wrong_reset, self.result)
             fresh = select(end.stays, select(end.rises, 1, 2), 0)
             for k in which:
-                if isinstance(model.switches[k], impact):
+                if model.switches[k].unilateral:
                     self.roots[k] = select(self.fired[k], fresh, self.roots[k]).astype(jnp.int32)
                 if k in model.contacts:
                     moved = self.set_in_motion(k, state, jumped, brief)
@@ -362,16 +357,22 @@ class _Event:
             roots[k] = select(left, 3, roots[k]).astype(jnp.int32)
         return state._replace(roots=tuple(roots))
 
-    def relays_on_their_surfaces(self, state: ModeState, after: Y) -> ModeState:
-        """The new surface of a relay may be the one just crossed (no hysteresis): then its root here is known."""
-        roots = list(state.roots)
-        for k in self.model.of_kind(relay):
+    def levels_just_passed(self, state: ModeState, after: Y) -> ModeState:
+        """Notes the root of the level that ends the new mode, where it is the one just passed: a relay without
+        hysteresis."""
+        levels, roots = self.model.which("levels"), list(state.roots)
+        if not levels:
+            return state
+        # The state has the rounding of the event's time, too.
+        f = self.later.flow(self.t, after, state)
+        size = frozen(jax.tree.map(lambda y, f: jnp.abs(y) + jnp.abs(self.t * f), after, f))
+        for k in levels:
             own = tuple(s.switch == k for s in self.model.slots)
 
             def guard(t: Scalar, y: Y, own: tuple[bool, ...] = own) -> list[Scalar]:
                 return self.later.guards(t, y, state, own)[own.index(True)]
 
-            on_it = jnp.abs(guard(self.t, after)[0]) <= self.later.rounding(guard, self.t, after)[0]
+            on_it = jnp.abs(guard(self.t, after)[0]) <= self.later.rounding(guard, self.t, after, size)[0]
             roots[k] = select(self.fired[k], on_it.astype(jnp.int32), roots[k])
         return state._replace(roots=tuple(roots))
 

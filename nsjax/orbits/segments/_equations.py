@@ -20,7 +20,6 @@ from ..._numerics._compile import interactive
 from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...flow._integrator import Integrator
-from ...system._impact import impact
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ...system._parameter import FreeParameters, get_parameter
@@ -184,7 +183,7 @@ class OrbitCurve(eqx.Module):
                 table = jnp.asarray([(s.switch, s.part) for s in model.slots], jnp.int32)
                 switch, wall = table[slot]
                 # Of several walls it is the one that is hit, which need not be the one that the segment has left.
-                hits = np.array([isinstance(s, impact) for s in model.switches])
+                hits = np.array([s.unilateral for s in model.switches])
                 hits = hits & (np.arange(len(hits), dtype=np.int32) == switch)
                 k = select(ends == EVENT, switch, -1)
                 state = self.state(mode, select(hits, wall, part))

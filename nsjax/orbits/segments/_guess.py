@@ -19,7 +19,6 @@ from ...flow._mode_flow import ModeFlow
 from ...flow._results import is_okay
 from ...flow._solution import Solution
 from ...flow._solve import integrate
-from ...system._clock import clock
 from ...system._mode import ModeState
 from ...system._model import SwitchedSystem
 from ...system._system import System
@@ -116,7 +115,7 @@ def _itinerary(
 def cuts_from(system: System, segments: Sequence[Segment], t0: Scalar, y0: Y, integrator: Integrator) -> SegmentGuess:
     """The segments that a user wrote down, each followed in its mode for as long as was said."""
     names = [k.name for k in system.switches]
-    ticking = [k for k, switch in enumerate(system.switches) if isinstance(switch, clock)]
+    ticking = [k for k, switch in enumerate(system.switches) if switch.ticking]
     # What a clock has counted follows from the time and its ticks.
     modes = [tuple(0 if k in ticking else m for k, m in enumerate(_mode(names, s.mode, ticking))) for s in segments]
     if not segments:

@@ -15,7 +15,6 @@ from ..._numerics._select import select
 from ..._types import Scalar, Y
 from ...flow._solution import Events
 from ...system._model import SwitchedSystem
-from ...system._sgn import sgn
 from ...system._system import arrays_of, System
 from .._orbit import Orbit
 
@@ -128,7 +127,7 @@ def event_slot(
     for i, switch in enumerate(model.switches):
         first, inside = slot_of(model, i, False, 0), jnp.zeros_like(entry)
         here = first + parts[i]
-        if isinstance(switch, sgn) and model.parts[i] > 1:  # below its components are one guard
+        if switch.signed and model.parts[i] > 1:  # below its components are one guard
             below = mode[i] < 0
             here, inside = select(below, first, here), select(below, parts[i], 0)
         if i in model.holdable:

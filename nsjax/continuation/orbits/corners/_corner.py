@@ -9,7 +9,6 @@ from ....orbits._settle import repeats_held
 from ....orbits.segments._equations import linearised, OrbitCurve
 from ....orbits.segments._itinerary import capacity_for, EVENT, GRAZING, REPELLING_EXIT, Start
 from ....setvalued._eigenvalue_crossings import eigenvalue_crossings
-from ....system._impact import impact
 from ..._tracer import Zero
 from .._bifurcation import OrbitBifurcation, Origin
 from .._branch_switching import (
@@ -128,7 +127,7 @@ def _once(tracer: OrbitTracer, zero: Zero, rows: list[int], times: int) -> tuple
 def is_impact(curve: OrbitCurve, spot: OrbitPoint, row: int) -> bool:
     """Whether a segment ends with an impact: one that becomes a grazing does nothing any more."""
     slot = curve.model.slots[int(spot.itinerary.slot[row])]
-    return isinstance(curve.model.switches[slot.switch], impact) and not slot.holding
+    return curve.model.switches[slot.switch].unilateral and not slot.holding
 
 
 def cycles_of(mapped: ReturnMap, most: int) -> Cycles:

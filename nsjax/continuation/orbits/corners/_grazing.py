@@ -7,7 +7,6 @@ import numpy as np
 from ...._numerics._bracket import bracketed
 from ....orbits.segments._equations import guards_along, OrbitCurve
 from ....orbits.segments._itinerary import capacity_for, EVENT, GRAZING, OrbitItinerary, Start, TIME
-from ....system._impact import impact
 from ..._tracer import Zero
 from .._test_functions import Test
 from .._tracer import alike, OrbitPoint, OrbitTracer
@@ -47,7 +46,7 @@ def touching_at(tracer: OrbitTracer, zero: Zero) -> Zero | None:
     def vanishes(i: int) -> bool:
         h, j = (i - 1) % n, (i + 1) % n
         before, after = slots[int(c.slot[h])], slots[int(c.slot[i])]
-        plain = not before.holding and not isinstance(curve.model.switches[before.switch], impact)
+        plain = not before.holding and not curve.model.switches[before.switch].unilateral
         crossed = c.ends[h] == c.ends[i] == EVENT and before.switch == after.switch
         return bool(plain and crossed and slow[h] and slow[i] and np.all(c.mode[h] == c.mode[j]))
 
