@@ -16,6 +16,7 @@ from ..flow._integrator import Integrator
 from ..flow._results import is_okay
 from ..flow._solution import Solution
 from ..flow._solve import integrate
+from ..system._level_switch import LevelSwitch
 from ..system._model import SwitchedSystem
 from ..system._system import System
 from ._orbit import distance, ravel
@@ -78,11 +79,11 @@ def relays_at(system: System, t0: Scalar, y0: Y, given: Relays) -> Relays:
 @interactive
 def undecided(system: System, t0: Scalar, y0: Y) -> dict[str, Bool[Array, ""]]:
     """Which switches with levels may have several modes at a state, as a relay has within its hysteresis."""
-    unsure, model = {}, SwitchedSystem.forwards(system, t0, y0)
-    for k in model.which("levels"):
-        switch = model.switches[k]
-        modes = jnp.stack([model.level_at(k, t0, y0, jnp.asarray(before, jnp.int32)) for before in switch.modes])
-        unsure[switch.name] = jnp.any(modes != modes[0])
+    unsure = {}
+    for switch in system.switches:
+        if isinstance(switch, LevelSwitch):
+            modes = [switch.mode_at(system, t0, y0, jnp.asarray(before, jnp.int32)) for before in switch.modes]
+            unsure[switch.name] = jnp.any(jnp.stack(modes) != modes[0])
     return unsure
 
 
