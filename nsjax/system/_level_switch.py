@@ -21,23 +21,8 @@ class LevelSwitch(AbstractSwitch):
 
     `relay` is one. A model may define kinds of its own by a subclass with `modes`, which lists the integers that its
     modes are, and with the three methods below. Its value in `vector_field` is the mode, unless `value` is overridden.
-    A solution never slides on its surfaces, and its events do not change the state.
-
-    ```python
-    class deadzone(nsjax.LevelSwitch):
-        modes = (-1, 0, 1)
-
-        def margin(self, system, t, y, mode):           # 0 while |h| < 1, else the sign of h
-            h = self.guard(system, t, y)
-            return jnp.where(mode == 0, 1 - h**2, mode * h - 1)
-
-        def mode_at(self, system, t, y, before):
-            h = self.guard(system, t, y)
-            return jnp.where(jnp.abs(h) > 1, jnp.sign(h), 0).astype(jnp.int32)
-
-        def next_mode(self, system, t, y, mode):
-            return jnp.where(mode == 0, jnp.sign(self.guard(system, t, y)), 0).astype(jnp.int32)
-    ```
+    A solution never slides on its surfaces, and its events do not change the state. The guide to modelling has a dead
+    zone as an example.
 
     **Arguments:**
 
