@@ -70,8 +70,9 @@ def test_told_and_drawn(trilinear, tmp_path):
     assert lines[0] == "1 branch of periodic orbits of Trilinear, 2 virtual"
     assert sum(line.endswith("points, virtual") for line in lines) == 2
     ax = plot.orbit_diagram(trilinear)
-    drawn = [line for line in ax.lines if line.get_label() == "virtual"]
+    drawn = [line for line in ax.lines if line.get_color() == "0.6"]
     assert len(drawn) == 2 and {line.get_linestyle() for line in drawn} == {":"}
+    assert [line.get_label() for line in ax.lines].count("virtual") == 1
     assert "virtual" in [text.get_text() for text in ax.get_legend().get_texts()]
     assert "virtual" not in [line.get_label() for line in plot.multiplier_diagram(trilinear).lines]
     plt.close("all")
