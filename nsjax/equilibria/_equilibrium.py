@@ -141,7 +141,7 @@ def equilibrium_in(system: System, t: Scalar, y0: Y, mode: tuple, newton: Newton
     end = jfu.ravel_pytree(frozen(z))[0]
     error, matrix = frozen((flat(end), jax.jacfwd(flat)(end)))
     rows, columns = equilibrated(matrix)
-    # Every step leaves its rounding in all unknowns; what is no larger than that is no size.
+    # Each of Newton's steps leaves its rounding in all unknowns. An unknown that is no larger has no size of its own.
     rounding = 10 * jnp.finfo(t.dtype).eps * columns * jnp.max(jnp.abs(end - start) / columns)
     sizes = sizes_near(matrix, jnp.maximum(jnp.abs(start), select(jnp.abs(end) > rounding, jnp.abs(end), 0)))
     left, singular, right = svd(rows[:, None] * matrix * columns)

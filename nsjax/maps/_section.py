@@ -130,7 +130,7 @@ def _onto(switch: AbstractSwitch, system: System, sol: Solution, y: Y) -> Y:
     still, t_still, x, before = frozen((system, sol.t1, flat, jfu.ravel_pytree(last)[0]))
 
     def gap(x: Array) -> Scalar:
-        return ft.reduce(jnp.minimum, switch.components(still, t_still, unravel(x)))
+        return switch.least(still, t_still, unravel(x))
 
     h, normal = jax.value_and_grad(gap)(x)
     rounding = float(jnp.finfo(x.dtype).eps) ** 0.5 * jnp.max(jnp.abs(x)) * jnp.linalg.norm(normal)

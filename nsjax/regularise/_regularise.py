@@ -54,8 +54,9 @@ def _sliding(system: System) -> tuple[AbstractSwitch, ...]:
     return tuple(k for k in system.switches if k.signed and not k.jumps)
 
 
-def _height(switch: AbstractSwitch, system: System, t: Scalar, y: Y) -> Scalar:
-    return ft.reduce(jnp.minimum, switch.components(system, t, y))
+def _smooth(system: System) -> tuple[AbstractSwitch, ...]:
+    """The switches that have a smooth function in their place, apart from those whose events reset the state."""
+    return tuple(k for k in system.switches if k.smoothed_value is not None and not k.jumps)
 
 
 def _field(system: System, t: Scalar, y: Y, replaced: Sequence[AbstractSwitch], values: _Values, others: _Values) -> Y:
@@ -104,13 +105,15 @@ class Smoothed(_Regularised):
 
     @property
     def replaced(self) -> tuple[AbstractSwitch, ...]:
-        return tuple(k for k in self.system.switches if k.smooths)
+        return _smooth(self.system)
 
     def put(self, t: Scalar, y: Y, s: SwitchValues) -> dict[str, Any]:
         def sign(h: Scalar) -> Scalar:
             return _CURVES[self.kind](self.eps * h)
 
-        return {k.name: k.smoothed_value(self.system, t, y, sign) for k in self.replaced}
+        return {
+            k.name: k.smoothed_value(self.system, t, y, sign) for k in self.replaced if k.smoothed_value is not None
+        }
 
     def vector_field(self, t: Scalar, y: Y, s: SwitchValues) -> Y:
         f = super().vector_field(t, y, s)
@@ -139,7 +142,7 @@ class Smoothed(_Regularised):
                 value = friction[k.name]
                 return jax.tree.leaves(jax.jvp(field, (value,), (jnp.ones_like(value),))[1])
 
-            g, jumps = _quotient(slope, lambda *x: _height(k, *place(*x)), x, jax.tree.leaves(f), 1 / self.eps)
+            g, jumps = _quotient(slope, lambda *x: k.least(*place(*x)), x, jax.tree.leaves(f), 1 / self.eps)
             text = (
                 f"Argument `offset` must name switches on whose surface the field is continuous, as |h| is, but "
                 f"`{type(self.system).__name__}.vector_field` jumps on that of `{k.name}` (or h has no gradient there)."
@@ -360,7 +363,7 @@ def smoothed(
     """
     check_system(system)
     frictions = _sliding(system)
-    _check_replaced(system, [k for k in system.switches if k.smooths])
+    _check_replaced(system, _smooth(system))
     if kind not in _CURVES:
         known = ", ".join(map(repr, _CURVES))
         raise ValueError(f"Argument `kind` must be one of {known}, but got {kind!r}.")

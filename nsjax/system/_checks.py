@@ -207,7 +207,7 @@ def forces_on_speeds(model: SwitchedSystem, t: Scalar, y: Y) -> dict[int, Bool[A
     zeros = tuple(jnp.zeros_like(t) for _ in model.switches)
     found = {}
     for k in model.which("unilateral"):
-        if k in model.contacts or model.switches[k].resets:
+        if k in model.contacts or model.switches[k].restitution_fn is None:
             continue
 
         def rates(value: Scalar, k: int = k) -> tuple[Scalar, ...]:

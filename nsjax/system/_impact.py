@@ -43,7 +43,6 @@ class impact(ResettingSwitch):
     order = 2
     holding = 1
     unilateral = True
-    restitution_fn: Callable[[Any], Any] | None = None
 
     if TYPE_CHECKING:
 
@@ -56,10 +55,6 @@ class impact(ResettingSwitch):
     @property
     def jumps(self) -> bool:
         return True
-
-    def coefficient(self, system: "System") -> Any:
-        assert self.restitution_fn is not None
-        return self.restitution_fn(system)
 
     def value(self, mode: Int[Array, ""], dtype: Any) -> Scalar:
         return jnp.zeros((), dtype)  # the contact force of a flight

@@ -1,6 +1,5 @@
 """The switch of dry friction and of Filippov systems: a sign, or while sliding the multiplier λ between the signs."""
 
-import functools as ft
 from collections.abc import Callable
 from typing import Any, Self, TYPE_CHECKING
 
@@ -97,12 +96,10 @@ class sgn(ResettingSwitch):
     def value(self, mode: Int[Array, ""], dtype: Any) -> Scalar:
         return super().value(select(mode == OFF, 0, mode) if self.condition else mode, dtype)
 
-    @property
-    def smooths(self) -> bool:
-        return not self.jumps
-
-    def smoothed_value(self, system: "System", t: Scalar, y: Y, sign: Callable[[Scalar], Scalar]) -> Scalar:
-        return sign(ft.reduce(jnp.minimum, self.components(system, t, y)))
+    def smoothed_value(  # pyright: ignore[reportIncompatibleVariableOverride]
+        self, system: "System", t: Scalar, y: Y, sign: Callable[[Scalar], Scalar]
+    ) -> Scalar:
+        return sign(self.least(system, t, y))
 
     def symbol(self, mode: int) -> str:
         return f"{self.name}{('0', '+', ':off', '-')[mode]}"

@@ -39,8 +39,13 @@ class AbstractSwitch(abc.ABC):
     ticking: ClassVar[bool] = False  # how many of its events, which happen at given times, have passed
     levels: ClassVar[bool] = False  # which of several levels the state has passed, see `LevelSwitch`
 
+    # `(system, t, y, sign)`: its value in a smoothed system, in which `sign` is a smooth function in place of the sign.
+    # Where it is None, the switch remains.
+    smoothed_value: ClassVar[Callable[..., Scalar] | None] = None
+
     guard: Guard
     name: str
+    restitution_fn: Callable[[Any], Any] | None = None  # Newton's coefficient of restitution, if it has this law
     condition: str = ""  # the name of the switch with whose closed contact alone it is there, see `sgn.while_`
     ends: tuple[int, ...] = ()  # where an event of this switch leads to one of these modes the solution ends
 
@@ -71,6 +76,10 @@ class AbstractSwitch(abc.ABC):
         h = self.guard(system, t, y)
         return h if isinstance(h, tuple) else (h,)
 
+    def least(self, system: "System", t: Scalar, y: Y) -> Scalar:
+        """The indicator function: the minimum of its components."""
+        return ft.reduce(jnp.minimum, self.components(system, t, y))
+
     def surfaces(self, system: "System", t: Scalar, y: Y) -> tuple[Scalar, ...]:
         """All indicator functions at whose zeros its mode may change."""
         return self.components(system, t, y)
@@ -79,15 +88,6 @@ class AbstractSwitch(abc.ABC):
     def jumps(self) -> bool:
         """Whether its events change the state."""
         return False
-
-    @property
-    def resets(self) -> bool:
-        """Whether it does so by a function of the user's, and not by a law of impact."""
-        return False
-
-    def coefficient(self, system: "System") -> Any:
-        """Newton's coefficient of restitution, of its law of impact."""
-        raise NotImplementedError(f"`{type(self).__name__}` has no law of impact.")
 
     def value(self, mode: Int[Array, ""], dtype: Any) -> Scalar:
         """What `vector_field` is given for it in a mode, unless it holds the solution."""
@@ -110,15 +110,6 @@ class AbstractSwitch(abc.ABC):
         """The modes to which its event leads where h rises (`direction` 1), falls (-1), or either (0)."""
         return self.modes
 
-    @property
-    def smooths(self) -> bool:
-        """Whether a regularised system has a smooth function in its place, see `smoothed_value`."""
-        return False
-
-    def smoothed_value(self, system: "System", t: Scalar, y: Y, sign: Callable[[Scalar], Scalar]) -> Scalar:
-        """Returns its value in a regularised system, in which `sign` is the smooth function that replaces a sign."""
-        raise NotImplementedError(f"`{type(self).__name__}` has no smooth value.")
-
     def words(self, mode: int) -> str:
         """The mode as a legend names it, if it needs to be named."""
         return ""
@@ -133,7 +124,7 @@ class AbstractSwitch(abc.ABC):
 
     def drawn(self, system: "System", t: Scalar, y: Y) -> dict[str, Scalar]:
         """The functions whose zeros are its surfaces in a phase plane, by their labels."""
-        return {f"{self.name}: h = 0": ft.reduce(jnp.minimum, self.components(system, t, y))}
+        return {f"{self.name}: h = 0": self.least(system, t, y)}
 
     # Its guards, positive while the mode lasts, as `SwitchedSystem.guards` puts them together.
 
@@ -200,10 +191,6 @@ class ResettingSwitch(AbstractSwitch):
 
     @property
     def jumps(self) -> bool:
-        return self.resets
-
-    @property
-    def resets(self) -> bool:
         return self.reset_fn is not None
 
     def _check_sign(self, system: "System", t: Scalar, y: Y) -> None:

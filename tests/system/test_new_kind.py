@@ -32,10 +32,6 @@ class deadzone(nsjax.LevelSwitch):
     def next_mode(self, system, t, y, mode):
         return jnp.where(mode == 0, jnp.sign(self.guard(system, t, y)), 0).astype(jnp.int32)
 
-    @property
-    def smooths(self):
-        return True
-
     def smoothed_value(self, system, t, y, sign):
         h = self.guard(system, t, y)
         return 0.5 * (sign(h - system.w) + sign(h + system.w))

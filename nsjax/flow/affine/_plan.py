@@ -102,7 +102,7 @@ def planned(
     if crossed:
         model = SwitchedSystem(model.system, model.direction, t, y, crossed=crossed)
     for k, switch in enumerate(model.switches):
-        newton = k in model.contacts and not switch.resets
+        newton = k in model.contacts and switch.restitution_fn is not None
         if k not in crossed and not (_simple(model, k, t, y) and (switch.signed or newton)):
             return None
     if not (model.steady and model.jointly_affine):
@@ -250,7 +250,9 @@ def constants(model: SwitchedSystem, plan: Plan, t: Scalar, y: Y) -> Constants:
 
             level[k] = columns(rate, plan, t)[0]
             gain[k] = level[k][: plan.size] @ push[k]
-            restitution[k] = jnp.asarray(model.switches[k].coefficient(model.system), t.dtype)
+            law = model.switches[k].restitution_fn
+            assert law is not None  # `planned` has asked for it
+            restitution[k] = jnp.asarray(law(model.system), t.dtype)
         else:
             gain[k] = jax.jvp(lambda x, k=k: model.h(k, t, unravel(x))[0], (still,), (push[k],))[1]
             bound[k] = jnp.asarray(model.bound(k), t.dtype)

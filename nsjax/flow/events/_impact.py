@@ -91,7 +91,9 @@ def rebound(gap: Gap, t: Scalar, y: Y, state: ModeState) -> tuple[Y, Y]:
         return out, jax.tree.map(lambda a, b: jnp.abs(a) + jnp.abs(b), y, out)
     fired, factors = dict(zip(gap.which, gap.fired)), []
     for k in gap.which:
-        factors.append(jnp.asarray(model.switches[k].coefficient(model.system), t.dtype))
+        restitution = model.switches[k].restitution_fn
+        assert restitution is not None
+        factors.append(jnp.asarray(restitution(model.system), t.dtype))
     e = gap.chosen(factors)
     e = select(model.direction > 0, e, 1 / e)
     k, can_rest = gap.which[0], gap.which[0] in model.contacts

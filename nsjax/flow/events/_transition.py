@@ -209,7 +209,7 @@ class _Event:
         model = self.model
 
         def alike(k: int) -> bool:
-            return k in model.contacts and not model.switches[k].resets
+            return k in model.contacts and model.switches[k].restitution_fn is not None
 
         group = tuple(filter(alike, model.jumping))
         return ([group] if group else []) + [(k,) for k in model.jumping if k not in group]
